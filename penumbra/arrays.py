@@ -1,0 +1,69 @@
+"""The arrays that pass between stages and into kernels, one NamedTuple per structure. numpy only.
+
+Space is world space and the unit is the scene's own, unless a line says otherwise. All arrays are
+C-contiguous; they are checked and cast where they enter the library, kernels never check.
+
+name            field        shape, dtype               meaning
+TriangleBatch   vertices     (n, 3, 3) f4 | f8          triangles as read, in file order
+                ids          (n,) i8                    triangle index (after fan triangulation)
+BlockerChunk    vertices     (n, 3, 3) f8               blockers in casting order
+                ids          (n,) i8                    triangle index
+                boxes_16     (ceil(n/16), 2, 3) f8      bounds of runs of 16 blockers, min and max
+                boxes_256    (ceil(n/256), 2, 3) f8     bounds of runs of 256
+                boxes_4096   (ceil(n/4096), 2, 3) f8    bounds of runs of 4096
+ChunkInfo       bucket, first, count, n_bytes  ints     where a chunk stands in its store
+                box          (2, 3) f8                  bounds of the chunk
+Receivers       points       (n, 3) f8                  receiver points
+                normals      (n, 3) f8 or (0, 3)        unit normals; empty: no facing test
+                own          (n,) i8                    triangle each point lies on, -1 for none
+                index        (n,) i8                    what the sample set is hashed from
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32Array = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+Int64Array = NDArray[np.int64]
+Int32Array = NDArray[np.int32]
+UInt64Array = NDArray[np.uint64]
+UInt8Array = NDArray[np.uint8]
+BoolArray = NDArray[np.bool_]
+
+
+class TriangleBatch(NamedTuple):
+    """A run of triangles as a mesh reader yields them."""
+
+    vertices: NDArray[np.floating]
+    ids: Int64Array
+
+
+class BlockerChunk(NamedTuple):
+    """A run of blockers in casting order, with the boxes of its runs of 16, 256 and 4096."""
+
+    vertices: Float64Array
+    ids: Int64Array
+    boxes_16: Float64Array
+    boxes_256: Float64Array
+    boxes_4096: Float64Array
+
+
+class ChunkInfo(NamedTuple):
+    """Where a chunk stands in its store, and its bounds: enough to decide not to read it."""
+
+    bucket: int
+    first: int
+    count: int
+    n_bytes: int
+    box: Float64Array
+
+
+class Receivers(NamedTuple):
+    """Points that ask which light samples they see."""
+
+    points: Float64Array
+    normals: Float64Array
+    own: Int64Array
+    index: Int64Array

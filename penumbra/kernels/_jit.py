@@ -1,0 +1,51 @@
+"""Compiler policy in one place: how every kernel is jitted, and where its machine code is kept.
+
+numba does not notice that a helper in another file has changed, so the cache folder carries a hash
+of all kernel sources: a changed kernel starts from an empty folder instead of running stale code.
+"""
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+
+_HERE = Path(__file__).parent
+
+
+def _sources_hash() -> str:
+    digest = hashlib.sha256()
+    for path in [*sorted(_HERE.glob("*.py")), _HERE.parent / "arrays.py"]:
+        digest.update(path.name.encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def cache_folder() -> Path:
+    """Folder of the compiled kernels: NUMBA_CACHE_DIR, or one per source hash in the user's cache."""
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(os.environ["NUMBA_CACHE_DIR"])
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "penumbra" / f"numba{numba.__version__}-{_sources_hash()}"
+
+
+# numba reads this setting at every compilation, so assigning it before the first decorator suffices.
+numba.config.CACHE_DIR = str(cache_folder())
+
+# error_model="numpy": with Python's division check loops do not vectorise. No fastmath: `contract`
+# breaks the antisymmetry of edge functions along a shared edge, `nnan` breaks tests against infinity.
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False}
+
+
+def helper(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Jit a function that only kernels call; it is compiled into its callers and not cached itself."""
+    jitted: Callable[..., Any] = numba.njit(**_OPTIONS)(function)
+    return jitted
+
+
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Jit a serial loop kernel called from Python: releases the GIL, kept in the cache folder."""
+    jitted: Callable[..., Any] = numba.njit(cache=True, **_OPTIONS)(function)
+    return jitted
