@@ -55,7 +55,7 @@ class ChunkInfo(NamedTuple):
 
     bucket: int
     first: int
-    count: int
+    count: int  # type: ignore[assignment]  # hides tuple.count
     n_bytes: int
     box: Float64Array
 
@@ -66,4 +66,22 @@ class Receivers(NamedTuple):
     points: Float64Array
     normals: Float64Array
     own: Int64Array
-    index: Int64Array
+    index: Int64Array  # type: ignore[assignment]  # hides tuple.index
+
+
+class LightSamples(NamedTuple):
+    """A planar light as casting sees it: light, groups, samples (HPC section 3.1).
+
+    K samples in G groups of `group_size` consecutive bits, S sets; P = G * group_size, the last group
+    padded with copies of the last sample.
+    """
+
+    corner: Float64Array  # (3,) corner of the light, world space
+    origin: Float64Array  # (3,) its centre
+    edge_u: Float64Array  # (3,) and
+    edge_v: Float64Array  # (3,): a sample is origin + s * edge_u + t * edge_v, within `residual`
+    parameters: Float32Array  # (S, 2, P) s and t, in [-1/2, 1/2]
+    points: Float64Array  # (S, P, 3) the samples themselves, world space
+    corners: Float64Array  # (1 + G, 4, 3) bounding polygons: the whole light, then each group; all sets
+    full_groups: UInt64Array  # (G,) the bits of a group that stand for samples, lowest bit first
+    residual: float  # largest distance per axis of a sample from its parametric position

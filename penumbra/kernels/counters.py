@@ -1,0 +1,39 @@
+"""Places of the counters that casting kernels add to: one int64 array of N_COUNTERS per task."""
+
+NAMES = (
+    "blockers_tested",  # blockers that entered a receiver hierarchy
+    "blockers_culled",  # blockers outside the shaft between a tile and the light
+    "nodes_visited",  # receiver nodes tested against a penumbra volume
+    "plane_box_tests",  # box against plane of a penumbra volume
+    "plane_point_tests",  # receiver against plane of a penumbra volume
+    "light_volumes_built",  # penumbra volumes of the whole light
+    "group_volumes_built",  # penumbra volumes of light sample groups
+    "umbra_nodes_skipped",  # nodes left because all is blocked below
+    "umbra_receivers_skipped",  # receivers left because all is blocked
+    "umbra_groups_skipped",  # light sample groups left because they are blocked
+    "pairs_tested",  # receiver x blocker pairs that reached the hard shadow volumes
+    "samples_tested",  # receiver x blocker x sample triples decided
+    "escalated_f64",  # of those, left open by float32 lanes
+    "escalated_exact",  # predicates decided in exact integers
+    "masks_allocated",  # masks taken from the pool
+    "masks_released",  # masks given back because all is blocked
+)
+(
+    BLOCKERS_TESTED,
+    BLOCKERS_CULLED,
+    NODES_VISITED,
+    PLANE_BOX_TESTS,
+    PLANE_POINT_TESTS,
+    LIGHT_VOLUMES_BUILT,
+    GROUP_VOLUMES_BUILT,
+    UMBRA_NODES_SKIPPED,
+    UMBRA_RECEIVERS_SKIPPED,
+    UMBRA_GROUPS_SKIPPED,
+    PAIRS_TESTED,
+    SAMPLES_TESTED,
+    ESCALATED_F64,
+    ESCALATED_EXACT,
+    MASKS_ALLOCATED,
+    MASKS_RELEASED,
+) = range(len(NAMES))
+N_COUNTERS = len(NAMES)

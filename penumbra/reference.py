@@ -1,0 +1,67 @@
+"""6: backend "reference", exact brute force by the definition of a bit; for small scenes and checks."""
+
+import numpy as np
+
+from penumbra.arrays import Receivers, UInt8Array, UInt64Array
+from penumbra.blockers import Blockers, prefetch
+from penumbra.executors.threads import run_tasks
+from penumbra.facing import face_light, masks_before_casting
+from penumbra.kernels.counters import N_COUNTERS, NAMES
+from penumbra.kernels.facing import FACES_NONE
+from penumbra.kernels.reference import cast_reference
+from penumbra.lights import RectLight, sample_sets_of
+from penumbra.options import CastOptions
+from penumbra.progress import Progress
+from penumbra.stats import Stats
+
+_GROUP_SIZE = 32
+_SLICE_RECEIVERS = 4096
+
+
+def cast_receivers(
+    receivers: Receivers,
+    blockers: Blockers,
+    light: RectLight,
+    *,
+    options: CastOptions,
+    threads: int,
+    progress: Progress,
+) -> tuple[UInt64Array, UInt8Array, Stats]:
+    """Masks uint64 (R, n_words), sample sets uint8 (R,) and Stats, by testing every pair.
+
+    Takes R * T * K steps: some 10^10 a minute. The options switch nothing here.
+    """
+    stats = Stats("reference")
+    with stats.timed("hierarchy"):
+        samples = light.light_samples(_GROUP_SIZE)
+        sample_sets = sample_sets_of(receivers.index, light.seed, light.sets)
+        facing = face_light(receivers, samples, sample_sets, light.samples, not light.two_sided)
+        masks = masks_before_casting(facing, light.samples)
+        live = np.flatnonzero(facing.state != FACES_NONE).astype(np.int64)
+    slices = [live[first : first + _SLICE_RECEIVERS] for first in range(0, len(live), _SLICE_RECEIVERS)]
+    progress.stage("cast", blockers.n_triangles, "triangles")
+    with stats.timed("cast"):
+        for number, chunk in prefetch(blockers, range(len(blockers.chunks)) if slices else ()):
+            stats.count("bytes_read", blockers.chunks[number].n_bytes)
+
+            def cast_slice(rows: np.ndarray, chunk=chunk) -> np.ndarray:  # type: ignore[no-untyped-def]
+                counters = np.zeros(N_COUNTERS, np.int64)
+                cast_reference(
+                    receivers.points,
+                    receivers.own,
+                    sample_sets,
+                    rows,
+                    chunk.vertices,
+                    chunk.ids,
+                    samples,
+                    light.samples,
+                    masks,
+                    counters,
+                )
+                return counters
+
+            for counters in run_tasks(cast_slice, slices, threads):
+                for name, amount in zip(NAMES, counters, strict=True):
+                    stats.count(name, amount)
+            progress.advance(len(chunk.ids))
+    return masks, sample_sets, stats
