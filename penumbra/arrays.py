@@ -85,3 +85,61 @@ class LightSamples(NamedTuple):
     corners: Float64Array  # (1 + G, 4, 3) bounding polygons: the whole light, then each group; all sets
     full_groups: UInt64Array  # (G,) the bits of a group that stand for samples, lowest bit first
     residual: float  # largest distance per axis of a sample from its parametric position
+
+
+class ReceiverBvh(NamedTuple):
+    """Receiver hierarchy of one tile; N nodes, n receivers in leaf order ("slots")."""
+
+    boxes: Float64Array  # (N, 6) min and max of the receivers below a node
+    first: Int32Array  # (N,) first slot below a node
+    count: Int32Array  # (N,) slots below a node
+    child: Int32Array  # (N,) left child, the right one follows; -1: a leaf
+    umbra: UInt64Array  # (N, ceil(G / 64)) group-umbra bits: group blocked for all receivers below
+    points: Float64Array  # (n, 3) receiver points by slot
+    own: Int64Array  # (n,) triangle each lies on
+    sample_set: UInt8Array  # (n,)
+    row: Int32Array  # (n,) the receiver's row in the tile
+
+
+class MaskPool(NamedTuple):
+    """Masks of a tile's m receivers, taken from a pool on demand (HPC section 3.3 D)."""
+
+    place: Int32Array  # (m,) row of `masks`, MASK_NONE (all samples visible) or MASK_UMBRA (none)
+    masks: UInt64Array  # (capacity, n_words) blocked samples
+    free: Int32Array  # (capacity,) stack of unused rows of `masks`
+    state: Int64Array  # (2,) how many of `free` are left; receivers that reached full umbra so far
+    full: UInt64Array  # (n_words,) mask with every sample blocked
+
+
+class CastScratch(NamedTuple):
+    """Working memory of one casting task; D levels, G groups."""
+
+    stack: Int32Array  # (2 * D + 2, 2) node and level to visit; node < 0: ~node is to be left
+    light_planes: Int64Array  # (D,) active plane set of the whole light, by level
+    n_active: Int64Array  # (D,) active groups, by level
+    active_group: Int32Array  # (D, G)
+    active_planes: Int64Array  # (D, G) active plane set of each active group
+    light_volume: Float64Array  # (4, 8) penumbra volume of the whole light
+    group_volumes: Float64Array  # (G, 4, 8)
+    group_found: Int64Array  # (G,) which of the eight planes a group's volume has
+    choices: Int64Array  # (2, 7) corners the planes went through: of the light, of the group in hand
+    blocker: Float64Array  # (6,) normal of the blocker and its componentwise permanent
+    edges: Float32Array  # (4, 4) edge functions over the light: A, B, C, bound
+
+
+class Shaft(NamedTuple):
+    """All segments between a tile's receivers and the light lie inside: what can be culled at once."""
+
+    box: Float64Array  # (6,) min and max
+    planes: Float64Array  # (12, 4) n . p <= d inside
+    extent: float  # largest coordinate of tile and light
+    reach: float  # longest segment
+
+
+class CastSwitches(NamedTuple):
+    """Optimizations A to D of HPC section 3.3, as kernels read them."""
+
+    umbra_bits: bool
+    active_planes: bool
+    lazy_volumes: bool
+    lazy_masks: bool

@@ -1,0 +1,178 @@
+"""6: backend "hpc", hierarchical penumbra casting (Laine & Aila 2005, section 3)."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from penumbra.arrays import BlockerChunk, CastScratch, CastSwitches, LightSamples, Receivers, UInt8Array, UInt64Array
+from penumbra.blockers import Blockers, prefetch
+from penumbra.executors.threads import run_tasks
+from penumbra.facing import face_light, full_mask, words_of
+from penumbra.kernels.casting import DONE, POOL_EMPTY, cast_blockers
+from penumbra.kernels.counters import N_COUNTERS, NAMES
+from penumbra.kernels.facing import FACES_NONE
+from penumbra.lights import RectLight, sample_sets_of
+from penumbra.options import CastOptions
+from penumbra.progress import Progress
+from penumbra.receivers import ReceiverTile, split_into_tiles
+from penumbra.stats import Stats
+
+_NEVER = 2**62
+
+
+def cast_receivers(
+    receivers: Receivers,
+    blockers: Blockers,
+    light: RectLight,
+    *,
+    options: CastOptions,
+    threads: int,
+    progress: Progress,
+) -> tuple[UInt64Array, UInt8Array, Stats]:
+    """Masks uint64 (R, n_words), sample sets uint8 (R,) and Stats of one pass over the blockers.
+
+    Receivers are split into tiles; each chunk of blockers, from large triangles to small, is cast on
+    every tile whose shaft to the light it touches. Threads take tiles from a queue.
+    """
+    stats = Stats("hpc")
+    with stats.timed("hierarchy"):
+        samples = light.light_samples(options.group_size)
+        sample_sets = sample_sets_of(receivers.index, light.seed, light.sets)
+        facing = face_light(receivers, samples, sample_sets, light.samples, not light.two_sided)
+        masks = np.zeros((len(receivers.points), words_of(light.samples)), np.uint64)
+        masks[facing.state == FACES_NONE] = full_mask(light.samples)
+        masks[facing.rows] = facing.masks
+        live = np.flatnonzero(facing.state != FACES_NONE)
+        tiles = _make_tiles(receivers, live, sample_sets, masks, samples, light.samples, options, threads)
+    with stats.timed("cast"):
+        counters = _cast_chunks(tiles, blockers, samples, options, threads, progress, stats)
+    for tile in tiles:
+        tile.copy_masks(masks)
+    _count(stats, counters, tiles, len(receivers.points) - len(live))
+    return masks, sample_sets, stats
+
+
+def _make_tiles(
+    receivers: Receivers,
+    live: np.ndarray,
+    sample_sets: UInt8Array,
+    masks: UInt64Array,
+    samples: LightSamples,
+    n_samples: int,
+    options: CastOptions,
+    threads: int,
+) -> list[ReceiverTile]:
+    """Tiles of the receivers that face the light, with their hierarchies built."""
+    partial = masks.any(axis=1)
+
+    def make(rows: np.ndarray) -> ReceiverTile:
+        tile = ReceiverTile(
+            rows,
+            receivers,
+            sample_sets,
+            samples,
+            full_mask(n_samples),
+            group_size=options.group_size,
+            leaf_receivers=options.leaf_receivers,
+            lazy_masks=options.lazy_masks,
+        )
+        started = np.flatnonzero(partial[rows])
+        tile.set_masks(started, masks[rows[started]])
+        tile.build()
+        return tile
+
+    return run_tasks(make, split_into_tiles(receivers.points, live, options.tile_receivers), threads)
+
+
+def _cast_chunks(
+    tiles: list[ReceiverTile],
+    blockers: Blockers,
+    samples: LightSamples,
+    options: CastOptions,
+    threads: int,
+    progress: Progress,
+    stats: Stats,
+) -> np.ndarray:
+    """Stream the chunks that matter through all tiles; returns counters (n_tiles, N_COUNTERS)."""
+    counters = np.zeros((len(tiles), N_COUNTERS), np.int64)
+    boxes = np.array([chunk.box for chunk in blockers.chunks]).reshape(-1, 2, 3)
+    touches = np.array([tile.touches(boxes) for tile in tiles]).reshape(len(tiles), len(boxes))
+    order = range(len(boxes)) if options.sort else range(len(boxes) - 1, -1, -1)
+
+    def wanted() -> Iterator[int]:
+        """Chunks that may still block something; the others are never read."""
+        for number in order:
+            info = blockers.chunks[number]
+            if any(touches[k, number] and tile.n_live for k, tile in enumerate(tiles)):
+                stats.count("bytes_read", info.n_bytes)
+                yield number
+            else:
+                stats.count("bytes_skipped", info.n_bytes)
+                progress.advance(info.count)
+
+    progress.stage("cast", blockers.n_triangles, "triangles")
+    for number, chunk in prefetch(blockers, wanted()):
+        work = [k for k, tile in enumerate(tiles) if touches[k, number] and tile.n_live]
+        run_tasks(lambda k, chunk=chunk: _cast_tile(tiles[k], chunk, samples, options, counters[k]), work, threads)
+        progress.advance(len(chunk.ids))
+    return counters
+
+
+def _cast_tile(
+    tile: ReceiverTile, chunk: BlockerChunk, samples: LightSamples, options: CastOptions, counters: np.ndarray
+) -> None:
+    """Cast a chunk on a tile; between blockers, grow its mask pool and rebuild its hierarchy as needed."""
+    switches = CastSwitches(
+        options.umbra_bits, options.active_planes, options.lazy_volumes, options.lazy_masks
+    )
+    start, reason = 0, POOL_EMPTY
+    while reason != DONE and tile.n_live:
+        scratch = _scratch(tile.depth, len(samples.full_groups))
+        rebuild_at = max(1, int(options.rebuild_fraction * tile.n_live)) if options.umbra_bits else _NEVER
+        if options.rebuild_fraction >= 1:
+            rebuild_at = _NEVER
+        start, reason = cast_blockers(
+            chunk,
+            start,
+            rebuild_at,
+            tile.shaft,
+            tile.bvh,
+            tile.pool,
+            samples,
+            options.group_size,
+            switches,
+            scratch,
+            counters,
+        )
+        if reason == POOL_EMPTY:
+            tile.grow_pool()
+            tile.refresh_umbra()
+        elif reason != DONE:
+            tile.rebuild()
+
+
+def _scratch(depth: int, n_groups: int) -> CastScratch:
+    levels = depth + 2
+    return CastScratch(
+        stack=np.empty((2 * levels + 2, 2), np.int32),
+        light_planes=np.zeros(levels, np.int64),
+        n_active=np.zeros(levels, np.int64),
+        active_group=np.zeros((levels, n_groups), np.int32),
+        active_planes=np.zeros((levels, n_groups), np.int64),
+        light_volume=np.zeros((4, 8)),
+        group_volumes=np.zeros((n_groups, 4, 8)),
+        group_found=np.zeros(n_groups, np.int64),
+        choices=np.zeros((2, 7), np.int64),
+        blocker=np.zeros(6),
+        edges=np.zeros((4, 4), np.float32),
+    )
+
+
+def _count(stats: Stats, counters: np.ndarray, tiles: list[ReceiverTile], n_not_cast: int) -> None:
+    for name, amount in zip(NAMES, counters.sum(axis=0), strict=True):
+        stats.count(name, amount)
+    stats.count("receivers_not_cast", n_not_cast)
+    stats.count("tiles", len(tiles))
+    stats.count("rebuilds", sum(tile.n_rebuilds for tile in tiles))
+    stats.count("mask_bytes", sum(tile.pool.masks.nbytes for tile in tiles))
+    stats.count("hierarchy_bytes", sum(tile.hierarchy_bytes for tile in tiles))

@@ -1,0 +1,397 @@
+"""Hierarchical penumbra casting: one blocker through the receivers of a tile (HPC figure 3).
+
+Letters A to D are the optimizations of HPC section 3.3, each behind its switch.
+"""
+
+import numpy as np
+
+from penumbra.kernels._jit import helper, kernel
+from penumbra.kernels.bits import ONE, ZERO, lowest_bit, popcount64
+from penumbra.kernels.counters import (
+    BLOCKERS_CULLED,
+    BLOCKERS_TESTED,
+    ESCALATED_F64,
+    GROUP_VOLUMES_BUILT,
+    LIGHT_VOLUMES_BUILT,
+    MASKS_ALLOCATED,
+    MASKS_RELEASED,
+    NODES_VISITED,
+    PAIRS_TESTED,
+    PLANE_BOX_TESTS,
+    PLANE_POINT_TESTS,
+    SAMPLES_TESTED,
+    UMBRA_GROUPS_SKIPPED,
+    UMBRA_NODES_SKIPPED,
+    UMBRA_RECEIVERS_SKIPPED,
+)
+from penumbra.kernels.hard_shadow import (
+    fill_blocker,
+    fill_edges,
+    light_side,
+    receiver_side,
+    test_samples,
+)
+from penumbra.kernels.penumbra_volume import (
+    ALL_PLANES,
+    clip_box,
+    contains_point,
+    fill_volume,
+    light_gap,
+)
+from penumbra.kernels.segment import segment_is_blocked
+from penumbra.kernels.shaft import box_outside_shaft, triangle_outside_shaft
+
+MASK_NONE = np.int32(-1)
+MASK_UMBRA = np.int32(-2)
+# What cast_blockers stopped for.
+DONE = np.int64(0)
+POOL_EMPTY = np.int64(1)
+REBUILD = np.int64(2)
+_WORD = np.int64(64)
+
+
+@helper
+def _group_bits(pool, place, group, group_size):
+    """The group's bits of a mask, lowest bit first."""
+    if place < 0:
+        return ZERO
+    bit = group * group_size
+    return pool.masks[place, bit >> 6] >> np.uint64(bit & 63)
+
+
+@helper
+def _is_full(pool, place):
+    for word in range(pool.full.shape[0]):
+        if pool.masks[place, word] != pool.full[word]:
+            return False
+    return True
+
+
+@helper
+def _take_mask(pool, row, counters):
+    """D: a cleared mask for a receiver, or -1 if the pool is empty."""
+    if pool.state[0] == 0:
+        return np.int32(-1)
+    pool.state[0] -= 1
+    place = pool.free[pool.state[0]]
+    pool.masks[place, :] = ZERO
+    pool.place[row] = place
+    counters[MASKS_ALLOCATED] += 1
+    return place
+
+
+@helper
+def _release_mask(pool, row, counters):
+    """D: give back the mask of a receiver in full umbra."""
+    pool.free[pool.state[0]] = pool.place[row]
+    pool.state[0] += 1
+    pool.place[row] = MASK_UMBRA
+    counters[MASKS_RELEASED] += 1
+
+
+@helper
+def _block_group(tri, side, straddles, bvh, slot, light, group, n_samples, known, scratch, counters):
+    """Bits of one group that the blocker blocks for a receiver; `known` are blocked already."""
+    full = light.full_groups[group]
+    sample_set = np.int64(bvh.sample_set[slot])
+    first = group * n_samples
+    counters[SAMPLES_TESTED] += n_samples
+    blocked, possible = test_samples(scratch.edges, straddles, light.parameters, sample_set, first, n_samples)
+    left_open = possible & ~blocked & ~known & full
+    if left_open != ZERO:
+        counters[ESCALATED_F64] += popcount64(left_open)
+        x, y, z = bvh.points[slot, 0], bvh.points[slot, 1], bvh.points[slot, 2]
+        while left_open != ZERO:
+            lane = lowest_bit(left_open)
+            left_open &= left_open - ONE
+            point = light.points[sample_set, first + lane]
+            if segment_is_blocked(side, x, y, z, point[0], point[1], point[2], tri, counters):
+                blocked |= ONE << np.uint64(lane)
+    return blocked & full & ~known
+
+
+@helper
+def _build_group_volumes(tri, light, extent, amplify, scratch, counters):
+    """C: penumbra volumes of all groups (HPC figure 3, line 62)."""
+    n_groups = light.full_groups.shape[0]
+    for group in range(n_groups):
+        scratch.choices[1, :] = scratch.choices[0]
+        scratch.group_found[group] = fill_volume(
+            tri, scratch.blocker, light, 1 + group, extent, amplify, scratch.choices[1], scratch.group_volumes[group]
+        )
+    counters[GROUP_VOLUMES_BUILT] += n_groups
+
+
+@helper
+def _node_is_umbra(bvh, node, n_groups):
+    """A: whether all groups are blocked for all receivers below a node."""
+    for word in range(bvh.umbra.shape[1]):
+        n_bits = min(_WORD, n_groups - word * _WORD)
+        full = ~ZERO if n_bits == _WORD else (ONE << np.uint64(n_bits)) - ONE
+        if bvh.umbra[node, word] != full:
+            return False
+    return True
+
+
+@helper
+def _update_leaf_umbra(bvh, node, pool, light, group_size):
+    """A: group-umbra bits of a leaf, the AND over its receivers (HPC figure 3, lines 77 to 80)."""
+    n_groups = light.full_groups.shape[0]
+    for word in range(bvh.umbra.shape[1]):
+        bvh.umbra[node, word] = ZERO
+    for group in range(n_groups):
+        full = light.full_groups[group]
+        all_blocked = True
+        for slot in range(bvh.first[node], bvh.first[node] + bvh.count[node]):
+            place = pool.place[bvh.row[slot]]
+            if place != MASK_UMBRA and (_group_bits(pool, place, group, group_size) & full) != full:
+                all_blocked = False
+                break
+        if all_blocked:
+            bvh.umbra[node, group >> 6] |= ONE << np.uint64(group & 63)
+
+
+@helper
+def _cast_on_receiver(tri, tri_side, slot, level, bvh, pool, light, group_size, switches, scratch, counters):
+    """Test a receiver inside V_L against the active groups; -1: pool empty, 1: a group became full."""
+    row = bvh.row[slot]
+    place = pool.place[row]
+    x, y, z = bvh.points[slot, 0], bvh.points[slot, 1], bvh.points[slot, 2]
+    side = np.int64(0)
+    group_filled = np.int64(0)
+    straddles = tri_side == 0
+    light_norm = (
+        abs(light.edge_u[0]) + abs(light.edge_u[1]) + abs(light.edge_u[2])
+        + abs(light.edge_v[0]) + abs(light.edge_v[1]) + abs(light.edge_v[2])
+    )  # fmt: skip
+    for k in range(scratch.n_active[level]):
+        group = np.int64(scratch.active_group[level, k])
+        full = light.full_groups[group]
+        known = _group_bits(pool, place, group, group_size) & full
+        if known == full and switches.umbra_bits:
+            counters[UMBRA_GROUPS_SKIPPED] += 1
+            continue
+        active = scratch.active_planes[level, k] & scratch.group_found[group]
+        counters[PLANE_POINT_TESTS] += popcount64(np.uint64(active))
+        if active != 0 and not contains_point(scratch.group_volumes[group], active, x, y, z):
+            continue
+        if side == 0:
+            side = receiver_side(tri, scratch.blocker, x, y, z, counters)
+            if side == 0 or side == tri_side:
+                return group_filled
+            counters[PAIRS_TESTED] += 1
+            fill_edges(tri, scratch.blocker, side, x, y, z, light, light_norm, straddles, scratch.edges)
+        new = _block_group(tri, side, straddles, bvh, slot, light, group, group_size, known, scratch, counters)
+        if new == ZERO:
+            continue
+        if place < 0:
+            place = _take_mask(pool, row, counters)
+            if place < 0:
+                return np.int64(-1)
+        bit = group * group_size
+        pool.masks[place, bit >> 6] |= new << np.uint64(bit & 63)
+        if known | new == full:
+            group_filled = np.int64(1)
+    if group_filled == 1 and switches.umbra_bits and _is_full(pool, place):
+        pool.state[1] += 1
+        if switches.lazy_masks:
+            _release_mask(pool, row, counters)
+        else:
+            pool.place[row] = MASK_UMBRA
+    return group_filled
+
+
+@helper
+def _narrow_groups(node, level, bvh, volumes_built, light, switches, scratch, counters):
+    """Fill the active groups of a level from those of the level above (HPC figure 3, lines 37 to 45)."""
+    n_active = 0
+    for k in range(scratch.n_active[level - 1]):
+        group = np.int64(scratch.active_group[level - 1, k])
+        planes = scratch.active_planes[level - 1, k]
+        if switches.umbra_bits and bvh.umbra[node, group >> 6] & (ONE << np.uint64(group & 63)):
+            counters[UMBRA_GROUPS_SKIPPED] += 1
+            continue
+        if volumes_built:
+            planes &= scratch.group_found[group]
+            if planes != 0:
+                counters[PLANE_BOX_TESTS] += popcount64(np.uint64(planes))
+                left = clip_box(scratch.group_volumes[group], planes, bvh.boxes, node)
+                if left < 0:
+                    continue
+                if switches.active_planes:
+                    planes = left
+        scratch.active_group[level, n_active] = group
+        scratch.active_planes[level, n_active] = planes
+        n_active += 1
+    scratch.n_active[level] = n_active
+    return n_active
+
+
+@helper
+def _cast_on_leaf(
+    tri, tri_id, tri_side, node, level, built, extent, amplify, bvh, pool, light, group_size, switches, scratch,
+    counters,
+):  # fmt: skip
+    """Test the receivers of a leaf; returns (status: -1 pool empty, 1 a group became full; volumes built)."""
+    status = np.int64(0)
+    planes = scratch.light_planes[level]
+    for slot in range(bvh.first[node], bvh.first[node] + bvh.count[node]):
+        place = pool.place[bvh.row[slot]]
+        if place == MASK_UMBRA:
+            counters[UMBRA_RECEIVERS_SKIPPED] += 1
+            continue
+        if bvh.own[slot] == tri_id:
+            continue
+        if planes != 0:
+            counters[PLANE_POINT_TESTS] += popcount64(np.uint64(planes))
+            x, y, z = bvh.points[slot, 0], bvh.points[slot, 1], bvh.points[slot, 2]
+            if not contains_point(scratch.light_volume, planes, x, y, z):
+                continue
+        if not built:
+            _build_group_volumes(tri, light, extent, amplify, scratch, counters)
+            built = True
+        found = _cast_on_receiver(
+            tri, tri_side, slot, level, bvh, pool, light, group_size, switches, scratch, counters
+        )
+        if found < 0:
+            return np.int64(-1), built
+        status |= found
+    return status, built
+
+
+@helper
+def _start_blocker(tri, shaft, light, switches, scratch, counters):
+    """Build V_L and the first level; returns (side of the blocker the light is on, amplify, built)."""
+    fill_blocker(tri, scratch.blocker)
+    extent = shaft.extent
+    for k in range(3):
+        for axis in range(3):
+            extent = max(extent, abs(tri[k, axis]))
+    tri_side = light_side(tri, scratch.blocker, light, extent)
+    gap = light_gap(tri, light)
+    amplify = shaft.reach / gap if gap > 0.0 else np.inf
+    n_groups = light.full_groups.shape[0]
+    scratch.choices[0, :] = -1
+    if amplify < np.inf:
+        scratch.light_planes[0] = fill_volume(
+            tri, scratch.blocker, light, 0, extent, amplify, scratch.choices[0], scratch.light_volume
+        )
+    else:
+        # The blocker touches the light: no plane can be trusted, every receiver is tested.
+        scratch.light_planes[0] = 0
+        scratch.group_found[:] = 0
+    counters[LIGHT_VOLUMES_BUILT] += 1
+    for group in range(n_groups):
+        scratch.active_group[0, group] = group
+        scratch.active_planes[0, group] = ALL_PLANES
+    scratch.n_active[0] = n_groups
+    built = amplify == np.inf
+    if not built and not switches.lazy_volumes:
+        _build_group_volumes(tri, light, extent, amplify, scratch, counters)
+        built = True
+    return tri_side, extent, amplify, built
+
+
+@helper
+def _leave_node(node, bvh):
+    """A: group-umbra bits of an inner node, the AND of its children (HPC figure 3, lines 50 to 54)."""
+    left = bvh.child[node]
+    for word in range(bvh.umbra.shape[1]):
+        bvh.umbra[node, word] = bvh.umbra[left, word] & bvh.umbra[left + 1, word]
+
+
+@helper
+def _cast_blocker(tri, tri_id, shaft, bvh, pool, light, group_size, switches, scratch, counters):
+    """Cast one blocker through the hierarchy; False if the mask pool ran empty."""
+    counters[BLOCKERS_TESTED] += 1
+    tri_side, extent, amplify, built = _start_blocker(tri, shaft, light, switches, scratch, counters)
+    umbra_changed = False
+    stack = scratch.stack
+    stack[0, 0], stack[0, 1] = 0, 1
+    height = 1
+    while height > 0:
+        height -= 1
+        node = np.int64(stack[height, 0])
+        level = np.int64(stack[height, 1])
+        if node < 0:
+            if umbra_changed:
+                _leave_node(~node, bvh)
+            continue
+        if switches.umbra_bits and _node_is_umbra(bvh, node, light.full_groups.shape[0]):
+            counters[UMBRA_NODES_SKIPPED] += 1
+            continue
+        counters[NODES_VISITED] += 1
+        planes = scratch.light_planes[level - 1]
+        if planes != 0:
+            counters[PLANE_BOX_TESTS] += popcount64(np.uint64(planes))
+            left = clip_box(scratch.light_volume, planes, bvh.boxes, node)
+            if left < 0:
+                continue
+            if switches.active_planes:
+                planes = left
+        scratch.light_planes[level] = planes
+        if _narrow_groups(node, level, bvh, built, light, switches, scratch, counters) == 0:
+            continue
+        if bvh.child[node] >= 0:
+            if switches.umbra_bits:
+                stack[height, 0], stack[height, 1] = ~node, level
+                height += 1
+            stack[height, 0], stack[height, 1] = bvh.child[node] + 1, level + 1
+            stack[height + 1, 0], stack[height + 1, 1] = bvh.child[node], level + 1
+            height += 2
+            continue
+        status, built = _cast_on_leaf(
+            tri, tri_id, tri_side, node, level, built, extent, amplify, bvh, pool, light, group_size, switches,
+            scratch, counters,
+        )  # fmt: skip
+        if status < 0:
+            return False
+        if status > 0 and switches.umbra_bits:
+            _update_leaf_umbra(bvh, node, pool, light, group_size)
+            umbra_changed = True
+    return True
+
+
+@kernel
+def cast_blockers(chunk, start, rebuild_at, shaft, bvh, pool, light, group_size, switches, scratch, counters):
+    """Cast the blockers of a chunk from `start` on; returns (where it stopped, DONE | POOL_EMPTY | REBUILD).
+
+    Runs of 4096, 256 and 16 blockers outside the tile's shaft are passed over at once. Stops when the
+    mask pool is empty (the blocker is to be cast again: setting its bits twice is harmless), and when
+    `rebuild_at` receivers have reached full umbra.
+    """
+    n_blockers = chunk.ids.shape[0]
+    t = np.int64(start)
+    while t < n_blockers:
+        skip = np.int64(0)
+        if t & 4095 == 0 and box_outside_shaft(shaft, chunk.boxes_4096, t >> 12):
+            skip = np.int64(4096)
+        elif t & 255 == 0 and box_outside_shaft(shaft, chunk.boxes_256, t >> 8):
+            skip = np.int64(256)
+        elif t & 15 == 0 and box_outside_shaft(shaft, chunk.boxes_16, t >> 4):
+            skip = np.int64(16)
+        elif triangle_outside_shaft(shaft, chunk.vertices[t]):
+            skip = np.int64(1)
+        if skip > 0:
+            counters[BLOCKERS_CULLED] += min(skip, n_blockers - t)
+            t += skip
+            continue
+        if not _cast_blocker(
+            chunk.vertices[t], chunk.ids[t], shaft, bvh, pool, light, group_size, switches, scratch, counters
+        ):
+            return t, POOL_EMPTY
+        t += 1
+        if pool.state[1] >= rebuild_at:
+            return t, REBUILD
+    return n_blockers, DONE
+
+
+@kernel
+def fill_umbra(bvh, n_nodes, pool, light, group_size):
+    """Group-umbra bits of all nodes of a new hierarchy, children before parents."""
+    for k in range(n_nodes):
+        node = n_nodes - 1 - k
+        if bvh.child[node] < 0:
+            _update_leaf_umbra(bvh, node, pool, light, group_size)
+        else:
+            _leave_node(node, bvh)

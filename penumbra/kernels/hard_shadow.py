@@ -1,0 +1,159 @@
+"""Hard shadow volumes of one blocker, tested for a whole row of light samples at once.
+
+The hard shadow volume of a blocker and a sample l is bounded by the blocker's plane and three planes
+through l and an edge (HPC section 3.1); a receiver r is inside iff four determinants have the right
+sign. Read with r fixed they are linear in l: over a planar light each is A + B s + C t. So the
+planes of all samples never need to be stored (8 sets of 256 would take 128 KB a blocker), and 16
+samples fit one vector of float32 lanes. A, B, C are computed in float64; only their last step is
+float32, with a bound; what falls inside the bound is decided by `segment`.
+"""
+
+import numpy as np
+
+from penumbra.kernels._jit import helper
+from penumbra.kernels.counters import ESCALATED_EXACT
+from penumbra.kernels.penumbra_volume import cross
+from penumbra.kernels.predicates import DET_BOUND, UNDECIDED, UNDERFLOW, UNIT_ROUNDOFF, orient3d_exact, sign_of
+
+# Lanes: coefficients scaled to at most 1, |s|, |t| <= 1/2. In units of 2**-24 the rounding of A, B, C
+# gives 2, of s and t 1, of the two products 1, of the two sums 3.5: 7.5, so 8.
+LANE_BOUND = np.float32(8.0 * 2.0**-24)
+# Float64 part: edge vectors 1, cross product 4, light vectors 1, dot product 3, of each term; doubled.
+_COEFFICIENT_BOUND = 20.0 * UNIT_ROUNDOFF
+_SMALLEST = 1e-250
+_LARGEST = 1e250
+_ONE = np.uint64(1)
+
+
+@helper
+def fill_blocker(tri, blocker):
+    """Set blocker (6,): normal (b - a) x (c - a), and the permanents of its three components."""
+    ux, uy, uz = tri[1, 0] - tri[0, 0], tri[1, 1] - tri[0, 1], tri[1, 2] - tri[0, 2]
+    vx, vy, vz = tri[2, 0] - tri[0, 0], tri[2, 1] - tri[0, 1], tri[2, 2] - tri[0, 2]
+    blocker[0], blocker[1], blocker[2] = cross(ux, uy, uz, vx, vy, vz)
+    blocker[3] = abs(uy * vz) + abs(uz * vy)
+    blocker[4] = abs(uz * vx) + abs(ux * vz)
+    blocker[5] = abs(ux * vy) + abs(uy * vx)
+
+
+@helper
+def receiver_side(tri, blocker, x, y, z, counters):
+    """Exact side of the blocker's plane on which a receiver lies: -1, 0 or 1."""
+    px, py, pz = x - tri[0, 0], y - tri[0, 1], z - tri[0, 2]
+    permanent = abs(px) * blocker[3] + abs(py) * blocker[4] + abs(pz) * blocker[5]
+    tiny = UNDERFLOW * (1.0 + abs(px) + abs(py) + abs(pz))
+    side = sign_of(px * blocker[0] + py * blocker[1] + pz * blocker[2], DET_BOUND * permanent + tiny)
+    if side == UNDECIDED:
+        counters[ESCALATED_EXACT] += 1
+        side = orient3d_exact(
+            tri[0, 0], tri[0, 1], tri[0, 2], tri[1, 0], tri[1, 1], tri[1, 2],
+            tri[2, 0], tri[2, 1], tri[2, 2], x, y, z,
+        )  # fmt: skip
+    return side
+
+
+@helper
+def light_side(tri, blocker, light, extent):
+    """Side of the blocker's plane on which every sample of the light lies for certain, or 0."""
+    lowest = np.inf
+    highest = -np.inf
+    for j in range(4):
+        height = (
+            blocker[0] * (light.corners[0, j, 0] - tri[0, 0])
+            + blocker[1] * (light.corners[0, j, 1] - tri[0, 1])
+            + blocker[2] * (light.corners[0, j, 2] - tri[0, 2])
+        )
+        lowest = min(lowest, height)
+        highest = max(highest, height)
+    permanent = blocker[3] + blocker[4] + blocker[5]
+    bound = permanent * (32.0 * UNIT_ROUNDOFF * extent + 4.0 * light.residual) + UNDERFLOW
+    if lowest > bound:
+        return np.int64(1)
+    return np.int64(-1) if highest < -bound else np.int64(0)
+
+
+@helper
+def _set_edge(k, a, b, c, error, edges):
+    """Store one function scaled to at most 1, with the bound of its lanes."""
+    largest = max(max(abs(a), abs(b)), abs(c))
+    if not (largest > _SMALLEST and largest < _LARGEST):
+        # Nothing is known: every lane is left open.
+        edges[k, 0] = edges[k, 1] = edges[k, 2] = np.float32(0.0)
+        edges[k, 3] = np.float32(np.inf)
+        return
+    scale = 1.0 / largest
+    edges[k, 0] = np.float32(a * scale)
+    edges[k, 1] = np.float32(b * scale)
+    edges[k, 2] = np.float32(c * scale)
+    edges[k, 3] = LANE_BOUND + np.float32(1.001 * error * scale)
+
+
+@helper
+def fill_edges(tri, blocker, side, x, y, z, light, light_norm, straddles, edges):
+    """Set edges (4, 4): functions A + B s + C t, >= 0 where the sample may be blocked, and their bounds.
+
+    side: the receiver's side of the blocker's plane (not 0); light_norm: |edge_u|_1 + |edge_v|_1.
+    The fourth function, the plane of the blocker, is needed only where the light straddles it.
+    """
+    u, v, o = light.edge_u, light.edge_v, light.origin
+    gx, gy, gz = o[0] - x, o[1] - y, o[2] - z
+    reach = _COEFFICIENT_BOUND * (abs(gx) + abs(gy) + abs(gz) + light_norm) + light.residual
+    flip = -float(side)
+    for k in range(3):
+        i = k + 1 if k < 2 else 0
+        wx, wy, wz = tri[k, 0] - x, tri[k, 1] - y, tri[k, 2] - z
+        ex, ey, ez = tri[i, 0] - tri[k, 0], tri[i, 1] - tri[k, 1], tri[i, 2] - tri[k, 2]
+        nx, ny, nz = cross(wx, wy, wz, ex, ey, ez)
+        nx, ny, nz = nx * flip, ny * flip, nz * flip
+        size = (abs(wx) + abs(wy) + abs(wz)) * (abs(ex) + abs(ey) + abs(ez))
+        _set_edge(
+            k,
+            nx * gx + ny * gy + nz * gz,
+            nx * u[0] + ny * u[1] + nz * u[2],
+            nx * v[0] + ny * v[1] + nz * v[2],
+            size * reach,
+            edges,
+        )
+    if straddles:
+        nx, ny, nz = blocker[0] * flip, blocker[1] * flip, blocker[2] * flip
+        hx, hy, hz = o[0] - tri[0, 0], o[1] - tri[0, 1], o[2] - tri[0, 2]
+        reach = _COEFFICIENT_BOUND * (abs(hx) + abs(hy) + abs(hz) + light_norm) + light.residual
+        _set_edge(
+            3,
+            nx * hx + ny * hy + nz * hz,
+            nx * u[0] + ny * u[1] + nz * u[2],
+            nx * v[0] + ny * v[1] + nz * v[2],
+            (blocker[3] + blocker[4] + blocker[5]) * reach,
+            edges,
+        )
+    else:
+        edges[3, 0] = np.float32(1.0)
+        edges[3, 1] = edges[3, 2] = edges[3, 3] = np.float32(0.0)
+
+
+@helper
+def test_samples(edges, straddles, parameters, sample_set, first, n_samples):
+    """Bits of a group's samples that are blocked for certain, and of those that may be."""
+    a0, b0, c0, e0 = edges[0, 0], edges[0, 1], edges[0, 2], edges[0, 3]
+    a1, b1, c1, e1 = edges[1, 0], edges[1, 1], edges[1, 2], edges[1, 3]
+    a2, b2, c2, e2 = edges[2, 0], edges[2, 1], edges[2, 2], edges[2, 3]
+    bound = max(max(e0, e1), max(e2, edges[3, 3]))
+    blocked = np.uint64(0)
+    possible = np.uint64(0)
+    for row in range(0, n_samples, 16):
+        row_blocked = np.uint32(0)
+        row_possible = np.uint32(0)
+        for lane in range(16):
+            s = parameters[sample_set, 0, first + row + lane]
+            t = parameters[sample_set, 1, first + row + lane]
+            f0 = a0 + b0 * s + c0 * t
+            f1 = a1 + b1 * s + c1 * t
+            f2 = a2 + b2 * s + c2 * t
+            f = min(min(f0, f1), f2)
+            if straddles:
+                f = min(f, edges[3, 0] + edges[3, 1] * s + edges[3, 2] * t)
+            row_blocked |= np.uint32(f > bound) << np.uint32(lane)
+            row_possible |= np.uint32(f >= -bound) << np.uint32(lane)
+        blocked |= np.uint64(row_blocked) << np.uint64(row)
+        possible |= np.uint64(row_possible) << np.uint64(row)
+    return blocked, possible

@@ -1,0 +1,195 @@
+"""Penumbra volumes from separating planes (HPC sections 3.1 and 3.2), conservative under rounding.
+
+A plane is (n, d) with n . p + d >= 0 inside. Eight planes, structure of arrays (4, 8), so that one
+vector of lanes tests them all: three through an edge of the blocker and a corner of the light, four
+through an edge of the light and a corner of the blocker, and the plane of the blocker as a cap.
+Places without a plane hold (0, 0, 0, 1), which is inside everywhere.
+
+Any direction n gives a bound, however it was rounded: if n . l <= n . q for all l of the light and q
+of the blocker, then a receiver r = q + k (q - l), k >= 0, has n . r >= min n . q. Where the planes
+touch both polygons, as separating planes do, n . l may exceed n . q by a rounding error e; then n . r
+can fall short by k e, and k is at most the reach of a shadow over the gap between blocker and light.
+Both go into the slack of d, some 1e-12 of the scene's size in ordinary scenes.
+"""
+
+import numpy as np
+
+from penumbra.kernels._jit import helper
+from penumbra.kernels.predicates import UNIT_ROUNDOFF
+
+N_PLANES = 8
+ALL_PLANES = np.int64(255)
+# Dot products of three terms, of both polygons, of receiver or box, and the rounding of d.
+TOLERANCE = 24.0 * UNIT_ROUNDOFF
+_NO_CHOICE = np.int64(-1)
+
+
+@helper
+def cross(ax, ay, az, bx, by, bz):
+    """Cross product of two vectors."""
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+@helper
+def light_gap(tri, light):
+    """Lower bound of the distance between a blocker and the light: largest gap along x, y, z, normal."""
+    gap = 0.0
+    for axis in range(3):
+        low = min(min(tri[0, axis], tri[1, axis]), tri[2, axis])
+        high = max(max(tri[0, axis], tri[1, axis]), tri[2, axis])
+        light_low = np.inf
+        light_high = -np.inf
+        for j in range(4):
+            light_low = min(light_low, light.corners[0, j, axis])
+            light_high = max(light_high, light.corners[0, j, axis])
+        gap = max(gap, max(low - light_high, light_low - high))
+    u, v, o = light.edge_u, light.edge_v, light.origin
+    nx, ny, nz = cross(u[0], u[1], u[2], v[0], v[1], v[2])
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    if length > 0.0:
+        low = np.inf
+        high = -np.inf
+        for k in range(3):
+            height = nx * (tri[k, 0] - o[0]) + ny * (tri[k, 1] - o[1]) + nz * (tri[k, 2] - o[2])
+            low = min(low, height)
+            high = max(high, height)
+        gap = max(gap, max(low, -high) / length)
+    # Rounding of the bound itself, and samples that lie off the polygon of the corners.
+    reach = abs(o[0]) + abs(o[1]) + abs(o[2]) + abs(tri[0, 0]) + abs(tri[0, 1]) + abs(tri[0, 2])
+    return gap * (1.0 - 1e-9) - 1e-13 * reach - 4.0 * light.residual
+
+
+@helper
+def _place_plane(nx, ny, nz, tri, corners, polygon, extent, amplify, residual, planes, k):
+    """Put the bound along direction n at place k; False where the direction does not separate."""
+    norm = abs(nx) + abs(ny) + abs(nz)
+    if not norm > 0.0:
+        return False
+    inside = np.inf
+    for q in range(3):
+        inside = min(inside, nx * tri[q, 0] + ny * tri[q, 1] + nz * tri[q, 2])
+    light_side = -np.inf
+    for j in range(4):
+        light_side = max(
+            light_side,
+            nx * corners[polygon, j, 0] + ny * corners[polygon, j, 1] + nz * corners[polygon, j, 2],
+        )
+    tolerance = norm * (TOLERANCE * extent + 2.0 * residual)
+    overlap = light_side - inside
+    if not overlap <= tolerance:
+        return False
+    slack = tolerance
+    if overlap > -2.0 * tolerance:
+        slack += 3.0 * amplify * tolerance
+    planes[0, k] = nx
+    planes[1, k] = ny
+    planes[2, k] = nz
+    planes[3, k] = slack - inside
+    return True
+
+
+@helper
+def _blocker_edge_normal(tri, corners, polygon, edge, corner):
+    """Normal of the plane through an edge of the blocker and a corner of the light, blocker inside."""
+    i = (edge + 1) % 3
+    j = (edge + 2) % 3
+    ax, ay, az = tri[edge, 0], tri[edge, 1], tri[edge, 2]
+    nx, ny, nz = cross(
+        tri[i, 0] - ax, tri[i, 1] - ay, tri[i, 2] - az,
+        corners[polygon, corner, 0] - ax, corners[polygon, corner, 1] - ay, corners[polygon, corner, 2] - az,
+    )  # fmt: skip
+    if nx * (tri[j, 0] - ax) + ny * (tri[j, 1] - ay) + nz * (tri[j, 2] - az) < 0.0:
+        return -nx, -ny, -nz
+    return nx, ny, nz
+
+
+@helper
+def _light_edge_normal(tri, corners, polygon, edge, vertex):
+    """Normal of the plane through an edge of the light and a corner of the blocker, light outside."""
+    i = (edge + 1) & 3
+    j = (edge + 2) & 3
+    ax, ay, az = corners[polygon, edge, 0], corners[polygon, edge, 1], corners[polygon, edge, 2]
+    nx, ny, nz = cross(
+        corners[polygon, i, 0] - ax, corners[polygon, i, 1] - ay, corners[polygon, i, 2] - az,
+        tri[vertex, 0] - ax, tri[vertex, 1] - ay, tri[vertex, 2] - az,
+    )  # fmt: skip
+    opposite = (
+        nx * (corners[polygon, j, 0] - ax)
+        + ny * (corners[polygon, j, 1] - ay)
+        + nz * (corners[polygon, j, 2] - az)
+    )
+    if opposite > 0.0:
+        return -nx, -ny, -nz
+    return nx, ny, nz
+
+
+@helper
+def fill_volume(tri, tri_normal, light, polygon, extent, amplify, choices, planes):
+    """Set planes (4, 8) to the penumbra volume of a blocker and a polygon of the light; return its set.
+
+    polygon 0 is the whole light, 1 + g a group. tri_normal (3,): normal of the blocker. extent: largest
+    coordinate that occurs; amplify: bound of k (module docstring). choices (7,) holds, and is given,
+    the corner that each of the first seven planes went through: that of the whole light is nearly
+    always right for its groups, which saves three quarters of the candidates.
+    """
+    found = np.int64(0)
+    residual = light.residual
+    corners = light.corners
+    for k in range(7):
+        n_candidates = 4 if k < 3 else 3
+        first = choices[k] if choices[k] != _NO_CHOICE else 0
+        choices[k] = _NO_CHOICE
+        for step in range(n_candidates):
+            candidate = (first + step) % n_candidates
+            if k < 3:
+                nx, ny, nz = _blocker_edge_normal(tri, corners, polygon, k, candidate)
+            else:
+                nx, ny, nz = _light_edge_normal(tri, corners, polygon, k - 3, candidate)
+            if _place_plane(nx, ny, nz, tri, corners, polygon, extent, amplify, residual, planes, k):
+                choices[k] = candidate
+                found |= np.int64(1) << k
+                break
+        if choices[k] == _NO_CHOICE:
+            planes[0, k] = planes[1, k] = planes[2, k] = 0.0
+            planes[3, k] = 1.0
+    nx, ny, nz = tri_normal[0], tri_normal[1], tri_normal[2]
+    if _place_plane(nx, ny, nz, tri, corners, polygon, extent, amplify, residual, planes, 7) or _place_plane(
+        -nx, -ny, -nz, tri, corners, polygon, extent, amplify, residual, planes, 7
+    ):
+        return found | np.int64(128)
+    planes[0, 7] = planes[1, 7] = planes[2, 7] = 0.0
+    planes[3, 7] = 1.0
+    return found
+
+
+@helper
+def clip_box(planes, active, boxes, node):
+    """Active planes that a node's box straddles, or -1 if the box is wholly outside an active one.
+
+    HPC section 3.3 B: a plane that has the whole box inside needs no test below that node.
+    """
+    lx, ly, lz = boxes[node, 0], boxes[node, 1], boxes[node, 2]
+    hx, hy, hz = boxes[node, 3], boxes[node, 4], boxes[node, 5]
+    outside = np.int64(0)
+    inside = np.int64(0)
+    for k in range(N_PLANES):
+        x0, x1 = planes[0, k] * lx, planes[0, k] * hx
+        y0, y1 = planes[1, k] * ly, planes[1, k] * hy
+        z0, z1 = planes[2, k] * lz, planes[2, k] * hz
+        farthest = (max(x0, x1) + max(y0, y1)) + (max(z0, z1) + planes[3, k])
+        nearest = (min(x0, x1) + min(y0, y1)) + (min(z0, z1) + planes[3, k])
+        outside |= np.int64(farthest < 0.0) << k
+        inside |= np.int64(nearest >= 0.0) << k
+    if outside & active:
+        return np.int64(-1)
+    return active & ~inside
+
+
+@helper
+def contains_point(planes, active, x, y, z):
+    """Whether a point is inside all active planes."""
+    outside = np.int64(0)
+    for k in range(N_PLANES):
+        height = (planes[0, k] * x + planes[1, k] * y) + (planes[2, k] * z + planes[3, k])
+        outside |= np.int64(height < 0.0) << k
+    return (outside & active) == 0
