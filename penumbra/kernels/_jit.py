@@ -45,6 +45,16 @@ def helper(function: Callable[..., Any]) -> Callable[..., Any]:
     return jitted
 
 
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Jit a helper that takes tuples of arrays and has one hot caller, into which LLVM must inline it.
+
+    A call passes eight words for every array of every tuple, some 300 for a casting step: left to
+    LLVM's own judgement those calls were most of the time of casting.
+    """
+    jitted: Callable[..., Any] = numba.njit(forceinline=True, **_OPTIONS)(function)
+    return jitted
+
+
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Jit a serial loop kernel called from Python: releases the GIL, kept in the cache folder."""
     jitted: Callable[..., Any] = numba.njit(cache=True, **_OPTIONS)(function)

@@ -5,8 +5,9 @@ Letters A to D are the optimizations of HPC section 3.3, each behind its switch.
 
 import numpy as np
 
-from penumbra.kernels._jit import helper, kernel
+from penumbra.kernels._jit import helper, inlined, kernel
 from penumbra.kernels.bits import ONE, ZERO, lowest_bit, popcount64
+from penumbra.kernels.borrow import borrow
 from penumbra.kernels.counters import (
     BLOCKERS_CULLED,
     BLOCKERS_TESTED,
@@ -33,6 +34,7 @@ from penumbra.kernels.hard_shadow import (
 )
 from penumbra.kernels.penumbra_volume import (
     ALL_PLANES,
+    VOLUME_SIZE,
     clip_box,
     contains_point,
     fill_volume,
@@ -50,7 +52,7 @@ REBUILD = np.int64(2)
 _WORD = np.int64(64)
 
 
-@helper
+@inlined
 def _group_bits(pool, place, group, group_size):
     """The group's bits of a mask, lowest bit first."""
     if place < 0:
@@ -59,7 +61,7 @@ def _group_bits(pool, place, group, group_size):
     return pool.masks[place, bit >> 6] >> np.uint64(bit & 63)
 
 
-@helper
+@inlined
 def _is_full(pool, place):
     for word in range(pool.full.shape[0]):
         if pool.masks[place, word] != pool.full[word]:
@@ -67,7 +69,7 @@ def _is_full(pool, place):
     return True
 
 
-@helper
+@inlined
 def _take_mask(pool, row, counters):
     """D: a cleared mask for a receiver, or -1 if the pool is empty."""
     if pool.state[0] == 0:
@@ -80,7 +82,7 @@ def _take_mask(pool, row, counters):
     return place
 
 
-@helper
+@inlined
 def _release_mask(pool, row, counters):
     """D: give back the mask of a receiver in full umbra."""
     pool.free[pool.state[0]] = pool.place[row]
@@ -89,7 +91,7 @@ def _release_mask(pool, row, counters):
     counters[MASKS_RELEASED] += 1
 
 
-@helper
+@inlined
 def _block_group(tri, side, straddles, bvh, slot, light, group, n_samples, known, scratch, counters):
     """Bits of one group that the blocker blocks for a receiver; `known` are blocked already."""
     full = light.full_groups[group]
@@ -110,7 +112,7 @@ def _block_group(tri, side, straddles, bvh, slot, light, group, n_samples, known
     return blocked & full & ~known
 
 
-@helper
+@inlined
 def _build_group_volumes(tri, light, extent, amplify, scratch, counters):
     """C: penumbra volumes of all groups (HPC figure 3, line 62)."""
     n_groups = light.full_groups.shape[0]
@@ -122,7 +124,7 @@ def _build_group_volumes(tri, light, extent, amplify, scratch, counters):
     counters[GROUP_VOLUMES_BUILT] += n_groups
 
 
-@helper
+@inlined
 def _node_is_umbra(bvh, node, n_groups):
     """A: whether all groups are blocked for all receivers below a node."""
     for word in range(bvh.umbra.shape[1]):
@@ -151,7 +153,7 @@ def _update_leaf_umbra(bvh, node, pool, light, group_size):
             bvh.umbra[node, group >> 6] |= ONE << np.uint64(group & 63)
 
 
-@helper
+@inlined
 def _cast_on_receiver(tri, tri_side, slot, level, bvh, pool, light, group_size, switches, scratch, counters):
     """Test a receiver inside V_L against the active groups; -1: pool empty, 1: a group became full."""
     row = bvh.row[slot]
@@ -173,7 +175,7 @@ def _cast_on_receiver(tri, tri_side, slot, level, bvh, pool, light, group_size, 
             continue
         active = scratch.active_planes[level, k] & scratch.group_found[group]
         counters[PLANE_POINT_TESTS] += popcount64(np.uint64(active))
-        if active != 0 and not contains_point(scratch.group_volumes[group], active, x, y, z):
+        if active != 0 and not contains_point(scratch.group_volumes, group * VOLUME_SIZE, active, x, y, z):
             continue
         if side == 0:
             side = receiver_side(tri, scratch.blocker, x, y, z, counters)
@@ -201,7 +203,7 @@ def _cast_on_receiver(tri, tri_side, slot, level, bvh, pool, light, group_size, 
     return group_filled
 
 
-@helper
+@inlined
 def _narrow_groups(node, level, bvh, volumes_built, light, switches, scratch, counters):
     """Fill the active groups of a level from those of the level above (HPC figure 3, lines 37 to 45)."""
     n_active = 0
@@ -215,7 +217,7 @@ def _narrow_groups(node, level, bvh, volumes_built, light, switches, scratch, co
             planes &= scratch.group_found[group]
             if planes != 0:
                 counters[PLANE_BOX_TESTS] += popcount64(np.uint64(planes))
-                left = clip_box(scratch.group_volumes[group], planes, bvh.boxes, node)
+                left = clip_box(scratch.group_volumes, group * VOLUME_SIZE, planes, bvh.boxes, node)
                 if left < 0:
                     continue
                 if switches.active_planes:
@@ -227,7 +229,7 @@ def _narrow_groups(node, level, bvh, volumes_built, light, switches, scratch, co
     return n_active
 
 
-@helper
+@inlined
 def _cast_on_leaf(
     tri, tri_id, tri_side, node, level, built, extent, amplify, bvh, pool, light, group_size, switches, scratch,
     counters,
@@ -245,7 +247,7 @@ def _cast_on_leaf(
         if planes != 0:
             counters[PLANE_POINT_TESTS] += popcount64(np.uint64(planes))
             x, y, z = bvh.points[slot, 0], bvh.points[slot, 1], bvh.points[slot, 2]
-            if not contains_point(scratch.light_volume, planes, x, y, z):
+            if not contains_point(scratch.light_volume, 0, planes, x, y, z):
                 continue
         if not built:
             _build_group_volumes(tri, light, extent, amplify, scratch, counters)
@@ -259,7 +261,7 @@ def _cast_on_leaf(
     return status, built
 
 
-@helper
+@inlined
 def _start_blocker(tri, shaft, light, switches, scratch, counters):
     """Build V_L and the first level; returns (side of the blocker the light is on, amplify, built)."""
     fill_blocker(tri, scratch.blocker)
@@ -292,7 +294,7 @@ def _start_blocker(tri, shaft, light, switches, scratch, counters):
     return tri_side, extent, amplify, built
 
 
-@helper
+@inlined
 def _leave_node(node, bvh):
     """A: group-umbra bits of an inner node, the AND of its children (HPC figure 3, lines 50 to 54)."""
     left = bvh.child[node]
@@ -300,7 +302,7 @@ def _leave_node(node, bvh):
         bvh.umbra[node, word] = bvh.umbra[left, word] & bvh.umbra[left + 1, word]
 
 
-@helper
+@inlined
 def _cast_blocker(tri, tri_id, shaft, bvh, pool, light, group_size, switches, scratch, counters):
     """Cast one blocker through the hierarchy; False if the mask pool ran empty."""
     counters[BLOCKERS_TESTED] += 1
@@ -324,7 +326,7 @@ def _cast_blocker(tri, tri_id, shaft, bvh, pool, light, group_size, switches, sc
         planes = scratch.light_planes[level - 1]
         if planes != 0:
             counters[PLANE_BOX_TESTS] += popcount64(np.uint64(planes))
-            left = clip_box(scratch.light_volume, planes, bvh.boxes, node)
+            left = clip_box(scratch.light_volume, 0, planes, bvh.boxes, node)
             if left < 0:
                 continue
             if switches.active_planes:
@@ -360,6 +362,8 @@ def cast_blockers(chunk, start, rebuild_at, shaft, bvh, pool, light, group_size,
     mask pool is empty (the blocker is to be cast again: setting its bits twice is harmless), and when
     `rebuild_at` receivers have reached full umbra.
     """
+    chunk, shaft, bvh, pool = borrow(chunk), borrow(shaft), borrow(bvh), borrow(pool)
+    light, scratch, counters = borrow(light), borrow(scratch), borrow(counters)
     n_blockers = chunk.ids.shape[0]
     t = np.int64(start)
     while t < n_blockers:

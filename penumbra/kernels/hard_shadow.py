@@ -10,8 +10,9 @@ float32, with a bound; what falls inside the bound is decided by `segment`.
 
 import numpy as np
 
-from penumbra.kernels._jit import helper
+from penumbra.kernels._jit import helper, inlined
 from penumbra.kernels.counters import ESCALATED_EXACT
+from penumbra.kernels.lanes import bits_above, bits_not_below, lesser, load, splat
 from penumbra.kernels.penumbra_volume import cross
 from penumbra.kernels.predicates import DET_BOUND, UNDECIDED, UNDERFLOW, UNIT_ROUNDOFF, orient3d_exact, sign_of
 
@@ -36,7 +37,7 @@ def fill_blocker(tri, blocker):
     blocker[5] = abs(ux * vy) + abs(uy * vx)
 
 
-@helper
+@inlined
 def receiver_side(tri, blocker, x, y, z, counters):
     """Exact side of the blocker's plane on which a receiver lies: -1, 0 or 1."""
     px, py, pz = x - tri[0, 0], y - tri[0, 1], z - tri[0, 2]
@@ -72,7 +73,7 @@ def light_side(tri, blocker, light, extent):
     return np.int64(-1) if highest < -bound else np.int64(0)
 
 
-@helper
+@inlined
 def _set_edge(k, a, b, c, error, edges):
     """Store one function scaled to at most 1, with the bound of its lanes."""
     largest = max(max(abs(a), abs(b)), abs(c))
@@ -88,7 +89,7 @@ def _set_edge(k, a, b, c, error, edges):
     edges[k, 3] = LANE_BOUND + np.float32(1.001 * error * scale)
 
 
-@helper
+@inlined
 def fill_edges(tri, blocker, side, x, y, z, light, light_norm, straddles, edges):
     """Set edges (4, 4): functions A + B s + C t, >= 0 where the sample may be blocked, and their bounds.
 
@@ -131,29 +132,24 @@ def fill_edges(tri, blocker, side, x, y, z, light, light_norm, straddles, edges)
         edges[3, 1] = edges[3, 2] = edges[3, 3] = np.float32(0.0)
 
 
-@helper
+@inlined
 def test_samples(edges, straddles, parameters, sample_set, first, n_samples):
     """Bits of a group's samples that are blocked for certain, and of those that may be."""
-    a0, b0, c0, e0 = edges[0, 0], edges[0, 1], edges[0, 2], edges[0, 3]
-    a1, b1, c1, e1 = edges[1, 0], edges[1, 1], edges[1, 2], edges[1, 3]
-    a2, b2, c2, e2 = edges[2, 0], edges[2, 1], edges[2, 2], edges[2, 3]
-    bound = max(max(e0, e1), max(e2, edges[3, 3]))
+    a0, b0, c0 = splat(edges[0, 0]), splat(edges[0, 1]), splat(edges[0, 2])
+    a1, b1, c1 = splat(edges[1, 0]), splat(edges[1, 1]), splat(edges[1, 2])
+    a2, b2, c2 = splat(edges[2, 0]), splat(edges[2, 1]), splat(edges[2, 2])
+    bound = max(max(edges[0, 3], edges[1, 3]), max(edges[2, 3], edges[3, 3]))
+    above, below = splat(bound), splat(-bound)
+    n_padded = parameters.shape[2]
+    start = sample_set * 2 * n_padded + first
     blocked = np.uint64(0)
     possible = np.uint64(0)
     for row in range(0, n_samples, 16):
-        row_blocked = np.uint32(0)
-        row_possible = np.uint32(0)
-        for lane in range(16):
-            s = parameters[sample_set, 0, first + row + lane]
-            t = parameters[sample_set, 1, first + row + lane]
-            f0 = a0 + b0 * s + c0 * t
-            f1 = a1 + b1 * s + c1 * t
-            f2 = a2 + b2 * s + c2 * t
-            f = min(min(f0, f1), f2)
-            if straddles:
-                f = min(f, edges[3, 0] + edges[3, 1] * s + edges[3, 2] * t)
-            row_blocked |= np.uint32(f > bound) << np.uint32(lane)
-            row_possible |= np.uint32(f >= -bound) << np.uint32(lane)
-        blocked |= np.uint64(row_blocked) << np.uint64(row)
-        possible |= np.uint64(row_possible) << np.uint64(row)
+        s = load(parameters, start + row)
+        t = load(parameters, start + n_padded + row)
+        f = lesser(lesser(a0 + b0 * s + c0 * t, a1 + b1 * s + c1 * t), a2 + b2 * s + c2 * t)
+        if straddles:
+            f = lesser(f, splat(edges[3, 0]) + splat(edges[3, 1]) * s + splat(edges[3, 2]) * t)
+        blocked |= np.uint64(bits_above(f, above)) << np.uint64(row)
+        possible |= np.uint64(bits_not_below(f, below)) << np.uint64(row)
     return blocked, possible

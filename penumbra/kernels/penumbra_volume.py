@@ -14,10 +14,12 @@ Both go into the slack of d, some 1e-12 of the scene's size in ordinary scenes.
 
 import numpy as np
 
-from penumbra.kernels._jit import helper
+from penumbra.kernels._jit import helper, inlined
+from penumbra.kernels.lanes import bits_above, bits_not_below, greater, lesser, load, splat
 from penumbra.kernels.predicates import UNIT_ROUNDOFF
 
 N_PLANES = 8
+VOLUME_SIZE = 4 * N_PLANES
 ALL_PLANES = np.int64(255)
 # Dot products of three terms, of both polygons, of receiver or box, and the rounding of d.
 TOLERANCE = 24.0 * UNIT_ROUNDOFF
@@ -162,34 +164,28 @@ def fill_volume(tri, tri_normal, light, polygon, extent, amplify, choices, plane
     return found
 
 
-@helper
-def clip_box(planes, active, boxes, node):
+@inlined
+def clip_box(planes, first, active, boxes, node):
     """Active planes that a node's box straddles, or -1 if the box is wholly outside an active one.
 
-    HPC section 3.3 B: a plane that has the whole box inside needs no test below that node.
+    planes: array that holds the volume (4, 8) from flat offset `first` on. HPC section 3.3 B: a plane
+    that has the whole box inside needs no test below that node.
     """
-    lx, ly, lz = boxes[node, 0], boxes[node, 1], boxes[node, 2]
-    hx, hy, hz = boxes[node, 3], boxes[node, 4], boxes[node, 5]
-    outside = np.int64(0)
-    inside = np.int64(0)
-    for k in range(N_PLANES):
-        x0, x1 = planes[0, k] * lx, planes[0, k] * hx
-        y0, y1 = planes[1, k] * ly, planes[1, k] * hy
-        z0, z1 = planes[2, k] * lz, planes[2, k] * hz
-        farthest = (max(x0, x1) + max(y0, y1)) + (max(z0, z1) + planes[3, k])
-        nearest = (min(x0, x1) + min(y0, y1)) + (min(z0, z1) + planes[3, k])
-        outside |= np.int64(farthest < 0.0) << k
-        inside |= np.int64(nearest >= 0.0) << k
-    if outside & active:
+    nx, ny, nz, d = load(planes, first), load(planes, first + 8), load(planes, first + 16), load(planes, first + 24)
+    x0, x1 = nx * splat(boxes[node, 0]), nx * splat(boxes[node, 3])
+    y0, y1 = ny * splat(boxes[node, 1]), ny * splat(boxes[node, 4])
+    z0, z1 = nz * splat(boxes[node, 2]), nz * splat(boxes[node, 5])
+    zero = splat(0.0)
+    farthest = (greater(x0, x1) + greater(y0, y1)) + (greater(z0, z1) + d)
+    if bits_above(zero, farthest) & active:
         return np.int64(-1)
-    return active & ~inside
+    nearest = (lesser(x0, x1) + lesser(y0, y1)) + (lesser(z0, z1) + d)
+    return active & ~bits_not_below(nearest, zero)
 
 
-@helper
-def contains_point(planes, active, x, y, z):
-    """Whether a point is inside all active planes."""
-    outside = np.int64(0)
-    for k in range(N_PLANES):
-        height = (planes[0, k] * x + planes[1, k] * y) + (planes[2, k] * z + planes[3, k])
-        outside |= np.int64(height < 0.0) << k
-    return (outside & active) == 0
+@inlined
+def contains_point(planes, first, active, x, y, z):
+    """Whether a point is inside all active planes of the volume at flat offset `first`."""
+    nx, ny, nz, d = load(planes, first), load(planes, first + 8), load(planes, first + 16), load(planes, first + 24)
+    height = (nx * splat(x) + ny * splat(y)) + (nz * splat(z) + d)
+    return bits_above(splat(0.0), height) & active == 0
