@@ -112,7 +112,7 @@ def _block_group(tri, side, straddles, bvh, slot, light, group, n_samples, known
     return blocked & full & ~known
 
 
-@inlined
+@helper
 def _build_group_volumes(tri, light, extent, amplify, scratch, counters):
     """C: penumbra volumes of all groups (HPC figure 3, line 62)."""
     n_groups = light.full_groups.shape[0]
@@ -261,7 +261,7 @@ def _cast_on_leaf(
     return status, built
 
 
-@inlined
+@helper
 def _start_blocker(tri, shaft, light, switches, scratch, counters):
     """Build V_L and the first level; returns (side of the blocker the light is on, amplify, built)."""
     fill_blocker(tri, scratch.blocker)
@@ -294,7 +294,7 @@ def _start_blocker(tri, shaft, light, switches, scratch, counters):
     return tri_side, extent, amplify, built
 
 
-@inlined
+@helper
 def _leave_node(node, bvh):
     """A: group-umbra bits of an inner node, the AND of its children (HPC figure 3, lines 50 to 54)."""
     left = bvh.child[node]
@@ -302,7 +302,7 @@ def _leave_node(node, bvh):
         bvh.umbra[node, word] = bvh.umbra[left, word] & bvh.umbra[left + 1, word]
 
 
-@inlined
+@helper
 def _cast_blocker(tri, tri_id, shaft, bvh, pool, light, group_size, switches, scratch, counters):
     """Cast one blocker through the hierarchy; False if the mask pool ran empty."""
     counters[BLOCKERS_TESTED] += 1

@@ -1,4 +1,4 @@
-"""Which of two triangles a ray meets first, exactly: a float64 filter, then integers.
+"""3: which of two triangles a ray meets first, exactly: a float64 filter, then integers.
 
 A ray from the eye along r = q - eye meets the plane of a, b, c at parameter t = D / S, with
 D = (a - eye) . N, S = r . N, N = (b - a) x (c - a). Surfaces that lie in one plane tie, and the lower
@@ -9,37 +9,39 @@ import numpy as np
 
 from penumbra.kernels._jit import helper
 from penumbra.kernels.exact import _accumulate, _fill_row, _multiply, _row_range, _sign
-from penumbra.kernels.predicates import (
-    DET_BOUND,
-    UNDECIDED,
-    UNDERFLOW,
-    UNIT_ROUNDOFF,
-    orient3d_sign,
-    sign_of,
-)
+from penumbra.kernels.predicates import DET_BOUND, UNDECIDED, UNDERFLOW, UNIT_ROUNDOFF, sign_of
+from penumbra.kernels.vec3 import absolute, cross, cross_permanent, dot, minus, side_of
+
+# Rows of the integer matrix: a - eye of both triangles, the ray, and the edges of both triangles.
+_NEW, _OLD, _RAY, _NEW_AB, _NEW_AC, _OLD_AB, _OLD_AC = range(7)
+_N_ROWS = 7
 
 
 @helper
-def _triple_product(px, py, pz, corners):
-    """p . N of nine corner coordinates, and its bound, for a rounded difference p."""
-    ux, uy, uz = corners[3] - corners[0], corners[4] - corners[1], corners[5] - corners[2]
-    vx, vy, vz = corners[6] - corners[0], corners[7] - corners[1], corners[8] - corners[2]
-    ax, bx = uy * vz, uz * vy
-    ay, by = uz * vx, ux * vz
-    az, bz = ux * vy, uy * vx
-    value = px * (ax - bx) + py * (ay - by) + pz * (az - bz)
-    size = abs(px) * (abs(ax) + abs(bx)) + abs(py) * (abs(ay) + abs(by)) + abs(pz) * (abs(az) + abs(bz))
-    return value, DET_BOUND * size + UNDERFLOW * (1.0 + abs(px) + abs(py) + abs(pz))
+def _triple_product(p, normal, permanent):
+    """Dot product p . normal of rounded differences, and the bound of its error."""
+    size = absolute(p)
+    bound = DET_BOUND * dot(size, permanent) + UNDERFLOW * (1.0 + size[0] + size[1] + size[2])
+    return dot(p, normal), bound
 
 
 @helper
-def _depth_order_filter(new, old, ex, ey, ez, qx, qy, qz):
+def _depth(triangle, eye, ray):
+    """D, its bound, S and its bound, of one triangle."""
+    a, b, c = triangle
+    ab, ac = minus(b, a), minus(c, a)
+    normal, permanent = cross(ab, ac), cross_permanent(ab, ac)
+    depth, depth_error = _triple_product(minus(a, eye), normal, permanent)
+    slope, slope_error = _triple_product(ray, normal, permanent)
+    return depth, depth_error, slope, slope_error
+
+
+@helper
+def _order_if_sure(new, old, eye, q):
     """Sign of t_new - t_old where float64 suffices, otherwise UNDECIDED."""
-    rx, ry, rz = qx - ex, qy - ey, qz - ez
-    d_new, d_new_error = _triple_product(new[0] - ex, new[1] - ey, new[2] - ez, new)
-    d_old, d_old_error = _triple_product(old[0] - ex, old[1] - ey, old[2] - ez, old)
-    s_new, s_new_error = _triple_product(rx, ry, rz, new)
-    s_old, s_old_error = _triple_product(rx, ry, rz, old)
+    ray = minus(q, eye)
+    d_new, d_new_error, s_new, s_new_error = _depth(new, eye, ray)
+    d_old, d_old_error, s_old, s_old_error = _depth(old, eye, ray)
     if abs(s_new) <= s_new_error or abs(s_old) <= s_old_error:
         return UNDECIDED
     left, right = d_new * s_old, d_old * s_new
@@ -57,37 +59,15 @@ def _depth_order_filter(new, old, ex, ey, ez, qx, qy, qz):
 
 
 @helper
-def _is_corner(corners, x, y, z):
-    for k in range(0, 9, 3):
-        if corners[k] == x and corners[k + 1] == y and corners[k + 2] == z:
-            return True
-    return False
-
-
-@helper
-def _in_one_plane(new, old):
-    """Whether two triangles, nine coordinates each, are exactly coplanar."""
-    for axis in range(3):
-        height = old[axis]
-        if (
-            old[axis + 3] == height
-            and old[axis + 6] == height
-            and new[axis] == height
-            and new[axis + 3] == height
-            and new[axis + 6] == height
-        ):
-            return True
-    for k in range(0, 9, 3):
-        x, y, z = new[k], new[k + 1], new[k + 2]
-        # A shared corner costs nothing here and microseconds in integers.
-        if _is_corner(old, x, y, z):
-            continue
-        sign = orient3d_sign(
-            old[0], old[1], old[2], old[3], old[4], old[5], old[6], old[7], old[8], x, y, z
-        )
-        if sign != 0:
-            return False
-    return True
+def _is_in_plane(triangle, p):
+    """Whether a point lies exactly in the plane of a triangle."""
+    a, b, c = triangle
+    # A shared corner, or a plane across an axis, costs nothing here and microseconds in integers.
+    if p in (a, b, c):
+        return True
+    if (a[0] == b[0] == c[0] == p[0]) or (a[1] == b[1] == c[1] == p[1]) or (a[2] == b[2] == c[2] == p[2]):
+        return True
+    return side_of(a, b, c, p) == 0
 
 
 @helper
@@ -111,44 +91,55 @@ def _fill_dot(u, v, pair, out):
 
 
 @helper
-def _depth_order_exact(new, old, ex, ey, ez, qx, qy, qz):
-    """Sign of t_new - t_old in integers; both triangles are hit, neither plane contains the eye."""
-    plus = np.empty((7, 3))
-    minus = np.empty((7, 3))
-    eye = (ex, ey, ez)
-    through = (qx, qy, qz)
-    for k in range(3):
-        plus[0, k], minus[0, k] = new[k], eye[k]
-        plus[1, k], minus[1, k] = old[k], eye[k]
-        plus[2, k], minus[2, k] = through[k], eye[k]
-        plus[3, k], minus[3, k] = new[k + 3], new[k]
-        plus[4, k], minus[4, k] = new[k + 6], new[k]
-        plus[5, k], minus[5, k] = old[k + 3], old[k]
-        plus[6, k], minus[6, k] = old[k + 6], old[k]
-    lows = np.empty(7, np.int64)
-    highs = np.empty(7, np.int64)
-    for row in range(7):
+def _fill_difference(row, p, q, plus, minus):
+    """Write a difference of points as row `row` of the exact matrix plus - minus."""
+    plus[row, 0], plus[row, 1], plus[row, 2] = p
+    minus[row, 0], minus[row, 1], minus[row, 2] = q
+
+
+@helper
+def _integer_rows(new, old, eye, q):
+    """The rows as integers, uint64 (7, 3, n_limbs), long enough for a product of two determinants."""
+    plus, minus = np.empty((_N_ROWS, 3)), np.empty((_N_ROWS, 3))
+    _fill_difference(_NEW, new[0], eye, plus, minus)
+    _fill_difference(_OLD, old[0], eye, plus, minus)
+    _fill_difference(_RAY, q, eye, plus, minus)
+    _fill_difference(_NEW_AB, new[1], new[0], plus, minus)
+    _fill_difference(_NEW_AC, new[2], new[0], plus, minus)
+    _fill_difference(_OLD_AB, old[1], old[0], plus, minus)
+    _fill_difference(_OLD_AC, old[2], old[0], plus, minus)
+    lows, highs = np.empty(_N_ROWS, np.int64), np.empty(_N_ROWS, np.int64)
+    for row in range(_N_ROWS):
         low, row_bits = _row_range(plus[row], minus[row])
         lows[row], highs[row] = low, low + row_bits
-    # The two rows of D are compared with each other, so they share one scale; each N has one anyway.
-    lows[0] = lows[1] = min(lows[0], lows[1])
-    highs[0] = highs[1] = max(highs[0], highs[1])
+    # D_new * S_old is compared with D_old * S_new: the first two rows must share a scale, and every
+    # other row is in both products.
+    lows[_NEW] = lows[_OLD] = min(lows[_NEW], lows[_OLD])
+    highs[_OLD] = max(highs[_NEW], highs[_OLD])
     bits = np.int64(12)
-    for row in range(1, 7):
+    for row in range(_OLD, _N_ROWS):
         bits += highs[row] - lows[row]
-    n_limbs = bits // 32 + 1
-    rows = np.zeros((7, 3, n_limbs), np.uint64)
-    for row in range(7):
+    rows = np.zeros((_N_ROWS, 3, bits // 32 + 1), np.uint64)
+    for row in range(_N_ROWS):
         _fill_row(rows[row], plus[row], minus[row], lows[row])
+    return rows
+
+
+@helper
+def _order_in_integers(new, old, eye, q):
+    """Sign of t_new - t_old; both triangles are hit, neither plane contains the eye."""
+    rows = _integer_rows(new, old, eye, q)
+    n_limbs = rows.shape[2]
     pair = np.empty(n_limbs, np.uint64)
-    normals = np.empty((2, 3, n_limbs), np.uint64)
-    _fill_cross(rows[3], rows[4], pair, normals[0])
-    _fill_cross(rows[5], rows[6], pair, normals[1])
-    d_new, d_old, s_new, s_old, total = np.empty((5, n_limbs), np.uint64)
-    _fill_dot(rows[0], normals[0], pair, d_new)
-    _fill_dot(rows[1], normals[1], pair, d_old)
-    _fill_dot(rows[2], normals[0], pair, s_new)
-    _fill_dot(rows[2], normals[1], pair, s_old)
+    normal = np.empty((3, n_limbs), np.uint64)
+    numbers = np.empty((5, n_limbs), np.uint64)
+    d_new, s_new, d_old, s_old, total = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    _fill_cross(rows[_NEW_AB], rows[_NEW_AC], pair, normal)
+    _fill_dot(rows[_NEW], normal, pair, d_new)
+    _fill_dot(rows[_RAY], normal, pair, s_new)
+    _fill_cross(rows[_OLD_AB], rows[_OLD_AC], pair, normal)
+    _fill_dot(rows[_OLD], normal, pair, d_old)
+    _fill_dot(rows[_RAY], normal, pair, s_old)
     _multiply(d_new, s_old, total)
     _multiply(d_old, s_new, pair)
     _accumulate(total, pair, True)
@@ -156,14 +147,14 @@ def _depth_order_exact(new, old, ex, ey, ez, qx, qy, qz):
 
 
 @helper
-def depth_order(new, old, ex, ey, ez, qx, qy, qz):
-    """Exact sign of t_new - t_old for two triangles (nine coordinates each) that the ray to q meets.
+def depth_order(new, old, eye, q):
+    """Exact sign of t_new - t_old for two triangles (a, b, c) that the ray from the eye to q meets.
 
     Returns (sign, coplanar): `coplanar` says that the two tie for every ray.
     """
-    sign = _depth_order_filter(new, old, ex, ey, ez, qx, qy, qz)
+    sign = _order_if_sure(new, old, eye, q)
     if sign != UNDECIDED:
         return sign, False
-    if _in_one_plane(new, old):
+    if _is_in_plane(old, new[0]) and _is_in_plane(old, new[1]) and _is_in_plane(old, new[2]):
         return np.int64(0), True
-    return _depth_order_exact(new, old, ex, ey, ez, qx, qy, qz), False
+    return _order_in_integers(new, old, eye, q), False

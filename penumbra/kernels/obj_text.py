@@ -68,7 +68,7 @@ def _begin_statement(mode, wanted, state, out_vertices):
         state[N_VERTICES] += 1
         if wanted == VERTEX:
             out_vertices[state[N_ROWS], :] = 0.0
-    if (mode == VERTEX or mode == FACE) and mode != wanted:
+    if mode in (VERTEX, FACE) and mode != wanted:
         mode = _OTHER
     state[MODE] = mode
 
@@ -175,7 +175,7 @@ def scan_statements(
                 if previous != 92 or mode == _COMMENT:
                     _end_statement(state, out_vertices, out_sizes, out_lines)
             pos += 1
-        elif mode == _OTHER or mode == _COMMENT:
+        elif mode in (_OTHER, _COMMENT):
             pos = next_newline(text, pos, end)
         elif is_blank(byte):
             pos += 1

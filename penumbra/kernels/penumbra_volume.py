@@ -57,7 +57,9 @@ def light_gap(tri, light):
             high = max(high, height)
         gap = max(gap, max(low, -high) / length)
     # Rounding of the bound itself, and samples that lie off the polygon of the corners.
-    reach = abs(o[0]) + abs(o[1]) + abs(o[2]) + abs(tri[0, 0]) + abs(tri[0, 1]) + abs(tri[0, 2])
+    reach = abs(o[0]) + abs(o[1]) + abs(o[2])
+    for k in range(3):
+        reach += abs(tri[k, 0]) + abs(tri[k, 1]) + abs(tri[k, 2])
     return gap * (1.0 - 1e-9) - 1e-13 * reach - 4.0 * light.residual
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from penumbra.arrays import Float32Array, Float64Array, Int64Array
 from penumbra.kernels._jit import helper, kernel
 from penumbra.kernels.depth_order import depth_order
-from penumbra.kernels.predicates import UNDECIDED, orient3d_exact, orient3d_filter
-from penumbra.kernels.raster_setup import set_up_triangle
+from penumbra.kernels.predicates import UNDECIDED
+from penumbra.kernels.raster_setup import set_up_triangle, through
+from penumbra.kernels.vec3 import load_triangle, side_of, side_of_if_sure
 
 LANES = 16
 # Rows of the lane buffer: least and greatest weight, and bounds of the ray parameter.
@@ -26,19 +27,24 @@ N_COUNTERS = 3
 class ZBand(NamedTuple):
     """The z-buffer of some rows of a window; one thread writes it."""
 
-    corner: Int64Array  # (2,) x and y of its upper left pixel in the full picture
     near: Float32Array  # (rows, width) the ray parameter of the nearest hit lies in [near, far];
     far: Float32Array  # (rows, width) both inf where nothing is hit
     own: Int64Array  # (rows, width) triangle index of the nearest hit, -1 for none
     vertices: Float64Array  # (rows, width, 9) its corners; undefined where own is -1
+    left: int  # x and
+    top: int  # y of the upper left pixel, in the full picture
 
 
 @helper
-def _narrow(a, step, bound, left, right):
-    """Pixels of [left, right) where a + x * step may be >= -bound; may return a pixel too many at each end."""
+def _narrow(function, y, left, right):
+    """Pixels of [left, right) of row y where a function may be >= -bound, or one more at each end."""
+    value, step, step_y, bound = function
+    if not bound < np.inf:
+        return left, right
+    value += y * step_y
     if step == 0.0:
-        return (left, right) if a >= -bound else (left, left)
-    edge = (-bound - a) / step
+        return (left, right) if value >= -bound else (left, left)
+    edge = (-bound - value) / step
     if step > 0.0:
         if edge >= right:
             return left, left
@@ -49,54 +55,42 @@ def _narrow(a, step, bound, left, right):
 
 
 @helper
-def _row_span(planes, y, left, right):
+def _row_span(functions, y, left, right):
     """Narrow [left, right) of row y to the pixels that the three edges may let through."""
-    for edge in range(3):
-        a = planes[edge, 0] + y * planes[edge, 2]
-        if left < right and planes[edge, 3] < np.inf:
-            left, right = _narrow(a, planes[edge, 1], planes[edge, 3], left, right)
-    return left, right
+    left, right = _narrow(functions[0], y, left, right)
+    left, right = _narrow(functions[1], y, left, right)
+    return _narrow(functions[2], y, left, right)
 
 
 @helper
-def _fill_lanes(planes, depth, depth_error, least, greatest, x, y, n, lanes):
+def _fill_lanes(functions, depth, depth_error, least, greatest, x, y, n, lanes):
     """Evaluate pixels (x .. x + n - 1, y), n <= 16: rows of `lanes` are bounds of weight and depth.
 
     lanes[LOW] > 0: surely inside; lanes[HIGH] < 0: surely outside; the hit's ray parameter is in
     [lanes[NEAR], lanes[FAR]], which is also within the triangle's own range [least, greatest].
     """
-    a0, b0, e0 = planes[0, 0] + y * planes[0, 2], planes[0, 1], planes[0, 3]
-    a1, b1, e1 = planes[1, 0] + y * planes[1, 2], planes[1, 1], planes[1, 3]
-    a2, b2, e2 = planes[2, 0] + y * planes[2, 2], planes[2, 1], planes[2, 3]
-    a3, b3, e3 = planes[3, 0] + y * planes[3, 2], planes[3, 1], planes[3, 3]
+    f0, f1, f2, f3 = functions
+    v0, v1, v2, v3 = f0[0] + y * f0[2], f1[0] + y * f1[2], f2[0] + y * f2[2], f3[0] + y * f3[2]
     for k in range(n):
         column = float(x + k)
-        w0, w1, w2 = a0 + column * b0, a1 + column * b1, a2 + column * b2
-        lanes[_LOW, k] = min(w0 - e0, w1 - e1, w2 - e2)
-        lanes[_HIGH, k] = min(w0 + e0, w1 + e1, w2 + e2)
-        slope = a3 + column * b3
-        # A slope that may be zero gives inf or a negative quotient; a hit has a positive one.
-        far = (depth + depth_error) / (slope - e3)
-        lanes[_NEAR, k] = max((depth - depth_error) / (slope + e3), least)
-        lanes[_FAR, k] = min(far, greatest) if slope > e3 else greatest
+        w0, w1, w2 = v0 + column * f0[1], v1 + column * f1[1], v2 + column * f2[1]
+        lanes[_LOW, k] = min(w0 - f0[3], w1 - f1[3], w2 - f2[3])
+        lanes[_HIGH, k] = min(w0 + f0[3], w1 + f1[3], w2 + f2[3])
+        slope = v3 + column * f3[1]
+        lanes[_NEAR, k] = max((depth - depth_error) / (slope + f3[3]), least)
+        # A slope that may be zero bounds nothing.
+        far = (depth + depth_error) / (slope - f3[3])
+        lanes[_FAR, k] = min(far, greatest) if slope > f3[3] else greatest
 
 
 @helper
-def _covers(v, side, ex, ey, ez, qx, qy, qz, counters):
-    """Whether the ray from the eye through q meets the closed triangle, exactly; side: where the eye is."""
-    for i in range(3):
-        j = (i + 1) % 3
-        sign = orient3d_filter(
-            ex, ey, ez, v[i, 0], v[i, 1], v[i, 2], v[j, 0], v[j, 1], v[j, 2], qx, qy, qz
-        )
-        if sign == UNDECIDED:
-            counters[ESCALATED_EXACT] += 1
-            sign = orient3d_exact(
-                ex, ey, ez, v[i, 0], v[i, 1], v[i, 2], v[j, 0], v[j, 1], v[j, 2], qx, qy, qz
-            )
-        if sign * side > 0:
-            return False
-    return True
+def _may_be_inside(eye, a, b, q, side, counters):
+    """Whether q is not beyond the plane through the eye and the edge a, b, exactly."""
+    sign = side_of_if_sure(eye, a, b, q)
+    if sign == UNDECIDED:
+        counters[ESCALATED_EXACT] += 1
+        sign = side_of(eye, a, b, q)
+    return sign * side <= 0
 
 
 @helper
@@ -104,68 +98,62 @@ def _is_hidden(band, left, top, right, bottom, least):
     """Whether every pixel of a small box already shows something nearer than `least`."""
     if (right - left) * (bottom - top) > LANES:
         return False
-    for row in range(top - band.corner[1], bottom - band.corner[1]):
-        for column in range(left - band.corner[0], right - band.corner[0]):
-            if not band.far[row, column] < least:
+    # Both sides rounded to float32: rounding keeps the order of what it keeps apart.
+    nearest = np.float32(least)
+    for row in range(top - band.top, bottom - band.top):
+        for column in range(left - band.left, right - band.left):
+            if not band.far[row, column] < nearest:
                 return False
     return True
 
 
 @helper
-def _through(view, x, y):
-    """The point q that the ray of pixel (x, y) goes through; the order of operations is part of the result."""
-    return (
-        view.eye[0] + ((view.d0[0] + y * view.dy[0]) + x * view.dx[0]),
-        view.eye[1] + ((view.d0[1] + y * view.dy[1]) + x * view.dx[1]),
-        view.eye[2] + ((view.d0[2] + y * view.dy[2]) + x * view.dx[2]),
-    )
+def _wins(eye, q, triangle, own, before, vertices, tied_with, counters):
+    """Whether a hit is seen rather than the one before it, whose depth is too close for float32.
 
-
-@helper
-def _wins(view, band, row, column, corners, own, near, far, tied_with, q, counters):
-    """Whether a hit is seen rather than what the z-buffer holds, and which triangle it ties with everywhere."""
-    before = band.own[row, column]
-    if before < 0 or far < band.near[row, column]:
-        return True, tied_with
+    Also returns the coplanar triangle met last: comparing with it again needs no depths.
+    """
     if before == tied_with:
         return own < before, tied_with
     counters[DEPTHS_COMPARED] += 1
-    order, coplanar = depth_order(
-        corners,
-        band.vertices[row, column],
-        view.eye[0],
-        view.eye[1],
-        view.eye[2],
-        q[0],
-        q[1],
-        q[2],
-    )
+    order, coplanar = depth_order(triangle, load_triangle(vertices), eye, q)
     return order < 0 or (order == 0 and own < before), (before if coplanar else tied_with)
 
 
 @helper
-def _rasterise_lanes(view, band, v, corners, own, side, lanes, x, y, n, tied_with, counters):
+def _rasterise_lanes(view, band, triangle, own, side, lanes, x, y, n, tied_with, counters):
     """Put up to 16 evaluated pixels of one row into the z-buffer; returns the coplanar triangle met last."""
-    row = y - band.corner[1]
+    row = y - band.top
+    a, b, c = triangle
     for k in range(n):
         if lanes[_HIGH, k] < 0.0:
             continue
-        column = x + k - band.corner[0]
+        column = x + k - band.left
         near, far = np.float32(lanes[_NEAR, k]), np.float32(lanes[_FAR, k])
         if near > band.far[row, column]:
             continue
-        q = _through(view, float(x + k), float(y))
-        if not lanes[_LOW, k] > 0.0 and not _covers(
-            v, side, view.eye[0], view.eye[1], view.eye[2], q[0], q[1], q[2], counters
+        q = through(view, float(x + k), float(y))
+        if not (
+            lanes[_LOW, k] > 0.0
+            or (
+                _may_be_inside(view.eye, a, b, q, side, counters)
+                and _may_be_inside(view.eye, b, c, q, side, counters)
+                and _may_be_inside(view.eye, c, a, q, side, counters)
+            )
         ):
             continue
-        seen, tied_with = _wins(view, band, row, column, corners, own, near, far, tied_with, q, counters)
+        before = band.own[row, column]
+        seen = before < 0 or far < band.near[row, column]
+        vertices = band.vertices[row, column]
+        if not seen:
+            seen, tied_with = _wins(view.eye, q, triangle, own, before, vertices, tied_with, counters)
         if seen:
             band.near[row, column] = near
             band.far[row, column] = far
             band.own[row, column] = own
-            for c in range(9):
-                band.vertices[row, column, c] = corners[c]
+            vertices[0], vertices[1], vertices[2] = a
+            vertices[3], vertices[4], vertices[5] = b
+            vertices[6], vertices[7], vertices[8] = c
     return tied_with
 
 
@@ -173,36 +161,34 @@ def _rasterise_lanes(view, band, v, corners, own, side, lanes, x, y, n, tied_wit
 def rasterise(vertices, ids, survivors, boxes, depths, view, band, counters):
     """Rasterise the surviving triangles of a chunk into one band.
 
-    vertices float64 (n, 3, 3), ids int64 (n,); survivors, boxes, depths from `fill_boxes`; counters
-    int64 (N_COUNTERS,) are added to.
+    vertices float64 (n, 9), ids int64 (n,); survivors, boxes, depths from `fill_boxes`; counters int64
+    (N_COUNTERS,) are added to.
     """
-    planes = np.empty((4, 4))
     lanes = np.empty((4, LANES))
-    first_row, last_row = band.corner[1], band.corner[1] + band.own.shape[0]
+    last_row = band.top + band.own.shape[0]
     for s in range(survivors.shape[0]):
-        top, bottom = max(boxes[s, 1], first_row), min(boxes[s, 3], last_row)
+        top, bottom = max(boxes[s, 1], band.top), min(boxes[s, 3], last_row)
         if top >= bottom:
             continue
         left, right = boxes[s, 0], boxes[s, 2]
         least, greatest = depths[s, 0], depths[s, 1]
         if _is_hidden(band, left, top, right, bottom, least):
             continue
-        i = survivors[s]
-        v = vertices[i]
-        side, depth, depth_error = set_up_triangle(view, v, planes)
+        own = ids[survivors[s]]
+        triangle = load_triangle(vertices[survivors[s]])
+        side, functions, depth, error = set_up_triangle(view, triangle[0], triangle[1], triangle[2])
         if side == 0:
             continue
-        corners = v.reshape(9)
         tied_with = np.int64(-1)
         for y in range(top, bottom):
             start, stop = left, right
             # Three divisions a row pay off only against more than one block of lanes.
             if right - left > LANES:
-                start, stop = _row_span(planes, float(y), left, right)
-            counters[PIXELS_TESTED] += stop - start
+                start, stop = _row_span(functions, float(y), left, right)
+            counters[PIXELS_TESTED] += max(stop - start, 0)
             for x in range(start, stop, LANES):
                 n = min(LANES, stop - x)
-                _fill_lanes(planes, depth, depth_error, least, greatest, x, float(y), n, lanes)
+                _fill_lanes(functions, depth, error, least, greatest, x, float(y), n, lanes)
                 tied_with = _rasterise_lanes(
-                    view, band, v, corners, ids[i], side, lanes, x, y, n, tied_with, counters
+                    view, band, triangle, own, side, lanes, x, y, n, tied_with, counters
                 )

@@ -1,0 +1,45 @@
+"""Scenes of the benchmarks: real meshes taken by path, with a camera and a light for each."""
+
+from pathlib import Path
+
+import numpy as np
+
+FOLDER = Path(__file__).resolve().parents[2] / "shared" / "scenes"
+
+# name: (mesh, up, floor: height and half width or None, eye, look_at, vfov, light corner, edge_u, edge_v)
+SCENES = {
+    "cornell": ("CornellBox-Original.obj", "y", None, [0, 1, 3.6], [0, 1, 0], 38,
+                [-0.24, 1.97, -0.22], [0.47, 0, 0], [0, 0, 0.38]),
+    "bunny": ("stanford-bunny.obj", "y", (0.033, 0.6), [-0.05, 0.2, 0.34], [-0.017, 0.1, 0], 38,
+              [-0.2, 0.4, 0.0], [0.12, 0, 0], [0, 0, 0.12]),
+    "sponza": ("sponza_dabrovic.ply", "y", None, [-6.5, 4.2, 1.6], [3, 2.2, -3.2], 62,
+               [-2, 14.5, -1.25], [4, 0, 0], [0, 0, 2.5]),
+    "dragon": ("mcguire_dragon.ply", "y", (0.0, 5), [1.2, 2.6, 3.9], [0.15, 0.65, -0.1], 40,
+               [-1.9, 3.6, -0.2], [1, 0, 0], [0, 0, 1]),
+    "house": ("small_house.ply", "z", None, [0, 14, 11], [0, 0, 0.5], 45,
+              [-3, 16, -6], [3, 0, 0], [0, 0, 3]),
+    "city": ("small_city.ply", "z", None, [180, 160, 220], [40, 0, 10], 45,
+             [-150, 260, -60], [60, 0, 0], [0, 0, 60]),
+    "office": ("office_env_large.ply", "z", None, [8, 1.7, 6], [0, 0.8, 0], 65,
+               [-1, 2.45, -1], [3, 0, 0], [0, 0, 3]),
+}  # fmt: skip
+
+
+def write_scene(name: str, folder: Path, meshes: Path = FOLDER, samples: int = 256, sets: int = 8) -> Path | None:
+    """Write a scene file (and a floor where the scene wants one); None if the mesh is not there."""
+    mesh, up, floor, eye, look_at, vfov, corner, edge_u, edge_v = SCENES[name]
+    if not (meshes / mesh).exists():
+        return None
+    lines = ["[[geometry]]", f'path = "{meshes / mesh}"', f'up = "{up}"']
+    if floor:
+        height, half = floor
+        corners = np.array([[-half, height, half], [half, height, half], [half, height, -half], [-half, height, -half]])
+        text = "".join("v {:.9g} {:.9g} {:.9g}\n".format(*c) for c in corners)
+        (folder / f"{name}-floor.obj").write_text(text + "f 1 2 3 4\n")
+        lines += ["[[geometry]]", f'path = "{name}-floor.obj"']
+    lines += ["[camera]", f"eye = {eye}", f"look_at = {look_at}", f"vfov = {vfov}", "resolution = [1280, 960]"]
+    lines += ["[[light]]", 'name = "key"', 'type = "rect"', f"corner = {corner}", f"edge_u = {edge_u}"]
+    lines += [f"edge_v = {edge_v}", f"samples = {samples}", f"sets = {sets}", "radiance = 10.0"]
+    path = folder / f"{name}.toml"
+    path.write_text("\n".join(lines) + "\n")
+    return path

@@ -1,0 +1,235 @@
+"""1: a scene file (TOML) becomes a `Scene`; whatever is wrong is named with its file, line and key."""
+
+import math
+import re
+import sys
+import tomllib
+from collections.abc import Callable, Sequence
+from difflib import get_close_matches
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NoReturn, TypeVar, cast
+
+import numpy as np
+
+from penumbra.errors import SceneError
+from penumbra.lights import RectLight
+from penumbra.scene import Camera, MeshRef, Scene, check_light_names
+
+TABLE_KEYS = {
+    "geometry": ("path", "transform", "up"),
+    "camera": ("eye", "look_at", "up", "vfov", "resolution"),
+    "light": (
+        "name",
+        "type",
+        "corner",
+        "edge_u",
+        "edge_v",
+        "samples",
+        "sets",
+        "radiance",
+        "two_sided",
+    ),
+}
+"""Every table of a scene file and every key it may have."""
+
+LIGHT_TYPES = ("rect",)
+
+_HEADER = re.compile(r"\s*\[\[?\s*([\w.-]+)\s*\]\]?\s*(?:#.*)?$")
+_KEY = re.compile(r"\s*[\"']?([\w-]+)[\"']?\s*(?:\.|=)")
+
+T = TypeVar("T")
+
+
+def read_scene(path: str | Path) -> Scene:
+    """Read a scene file; mesh paths in it are relative to its folder.
+
+    Raises `SceneError` with one sentence that names the file, and the line and key where there is one.
+    """
+    path = Path(path)
+    text = _read_text(path)
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{path}: not valid TOML: {error}") from None
+    lines = _key_lines(text)
+    root = _Table(path, "", content, lines.get(("", 0), {}))
+    root.check_keys(tuple(TABLE_KEYS), "the scene file")
+    tables = {
+        kind: [
+            _Table(path, kind, entry, lines.get((kind, number), {}), number, len(entries))
+            for number, entry in enumerate(entries)
+        ]
+        for kind, entries in _entries(root).items()
+    }
+    for kind, of_kind in tables.items():
+        for table in of_kind:
+            table.check_keys(TABLE_KEYS[kind], table.label)
+    geometry = tuple(_geometry(table) for table in tables["geometry"])
+    camera = _camera(tables["camera"][0])
+    lights = tuple(_light(table) for table in tables["light"])
+    for n_names, table in enumerate(tables["light"], start=1):
+        table.build(partial(check_light_names, [light.name for light in lights[:n_names]]))
+    return Scene(geometry, camera, lights, path)
+
+
+class _Table:
+    """One table of the file: typed look-ups whose errors say where."""
+
+    def __init__(
+        self,
+        path: Path,
+        kind: str,
+        values: dict[str, Any],
+        lines: dict[str, int],
+        number: int = 0,
+        of: int = 1,
+    ) -> None:
+        self.path, self.kind, self.values, self._lines = path, kind, values, lines
+        self.label = f"[{kind}]" if kind == "camera" else f"[[{kind}]]" + (f" {number + 1}" if of > 1 else "")
+
+    def refuse(self, message: str, key: str | None = None) -> NoReturn:
+        """Raise `SceneError`, naming the file and the line of the key, or else of the table."""
+        line = self._lines.get(key or "", self._lines.get(""))
+        raise SceneError(f"{self.path}{f':{line}' if line else ''}: {message}")
+
+    def check_keys(self, valid: Sequence[str], where: str) -> None:
+        """Refuse the first key that is not valid, and name the valid one nearest to it."""
+        for key in self.values:
+            if key not in valid:
+                nearest = get_close_matches(key, valid, n=1, cutoff=0.0)[0]
+                self.refuse(
+                    f"unknown key '{key}' in {where}; the nearest valid key is '{nearest}' "
+                    f"(of {', '.join(valid)})",
+                    key,
+                )
+
+    def get(self, key: str, check: Callable[[Any], bool], wanted: str, default: Any = None) -> Any:
+        """The value of a key, or its default; None as default makes the key necessary."""
+        if key not in self.values:
+            if default is None:
+                self.refuse(f"'{key}' is missing in {self.label}: it must be {wanted}")
+            return default
+        if not check(self.values[key]):
+            self.refuse(f"'{key}' in {self.label} is {self.values[key]!r}: it must be {wanted}", key)
+        return self.values[key]
+
+    def build(self, make: Callable[[], T]) -> T:
+        """Make a part of the scene; what it refuses is told with the line of the key it speaks of."""
+        try:
+            return make()
+        except SceneError as error:
+            found = [(m.start(), key) for key in self.values if (m := re.search(rf"\b{key}\b", str(error)))]
+            self.refuse(f"{error}", min(found)[1] if found else None)
+
+
+def _geometry(table: _Table) -> MeshRef:
+    name = table.get("path", _is_text, "the name of a mesh file or blocker store")
+    path = table.path.parent / name
+    if not path.is_file():
+        table.refuse(f"'path' in {table.label}: there is no file {path}", "path")
+    up = cast(Literal["y", "z"], table.get("up", lambda v: v in ("y", "z"), '"y" or "z"', "y"))
+    numbers = table.get("transform", _are_numbers(16), "16 finite numbers, row by row", ())
+    transform = np.array(numbers, dtype=np.float64).reshape(4, 4) if numbers else None
+    return table.build(lambda: MeshRef(path, transform, up))
+
+
+def _camera(table: _Table) -> Camera:
+    three = "three finite numbers"
+    eye = table.get("eye", _are_numbers(3), three)
+    look_at = table.get("look_at", _are_numbers(3), three)
+    up = table.get("up", _are_numbers(3), three, Camera.up)
+    vfov = table.get("vfov", _is_number, "a number of degrees between 0 and 180", Camera.vfov)
+    resolution = table.get(
+        "resolution", _are_whole(2), "two whole numbers, width and height in pixels", Camera.resolution
+    )
+    return table.build(lambda: Camera(eye, look_at, up, vfov, resolution))
+
+
+def _light(table: _Table) -> RectLight:
+    three = "three finite numbers"
+    name = table.get("name", _is_text, "a text, unique and without a dot")
+    kinds = " or ".join(f'"{kind}"' for kind in LIGHT_TYPES)
+    table.get("type", lambda v: v in LIGHT_TYPES, kinds, LIGHT_TYPES[0])
+    corner, edge_u, edge_v = (
+        table.get(key, _are_numbers(3), three) for key in ("corner", "edge_u", "edge_v")
+    )
+    samples = table.get("samples", _is_whole, "a whole number above 0", RectLight.samples)
+    sets = table.get("sets", _is_whole, "a whole number above 0", RectLight.sets)
+    radiance = table.get("radiance", _is_number, "a finite number", RectLight.radiance)
+    two_sided = table.get("two_sided", lambda v: isinstance(v, bool), "true or false", RectLight.two_sided)
+    return table.build(
+        lambda: RectLight(
+            corner, edge_u, edge_v, samples, sets, two_sided=two_sided, radiance=float(radiance), name=name
+        )
+    )
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path}: not a scene file: byte {error.start} is not UTF-8 text") from None
+    except OSError as error:
+        raise SceneError(f"cannot read the scene file {path}: {error.strerror}") from None
+
+
+def _entries(root: _Table) -> dict[str, list[dict[str, Any]]]:
+    """The tables of each kind: one camera, and at least one mesh and one light."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for kind in TABLE_KEYS:
+        header = f"[{kind}]" if kind == "camera" else f"[[{kind}]]"
+        value = root.values.get(kind)
+        entries = [value] if kind == "camera" else value
+        if value is None or value == []:
+            root.refuse(
+                f"there is no {header}: a scene needs a camera, at least one mesh and at least one light"
+            )
+        if not (isinstance(entries, list) and all(isinstance(entry, dict) for entry in entries)):
+            root.refuse(
+                f"'{kind}' must be a table: write {header} on a line of its own, its keys below", kind
+            )
+        found[kind] = entries
+    return found
+
+
+def _key_lines(text: str) -> dict[tuple[str, int], dict[str, int]]:
+    """Line of each key, by (table, its number); the key "" is the table's own header.
+
+    A look at the text and no parser: it is only asked about files that are valid TOML, and a key
+    that is written in another way (an inline table) is reported without its line.
+    """
+    lines: dict[tuple[str, int], dict[str, int]] = {}
+    current, seen = lines.setdefault(("", 0), {}), dict.fromkeys(TABLE_KEYS, 0)
+    for number, line in enumerate(text.splitlines(), start=1):
+        if header := _HEADER.match(line):
+            kind = header[1]
+            lines[("", 0)].setdefault(kind, number)
+            current = lines.setdefault((kind, seen.get(kind, 0)), {"": number})
+            seen[kind] = seen.get(kind, 0) + 1
+        elif key := _KEY.match(line):
+            current.setdefault(key[1], number)
+    return lines
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip())
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _is_number(value: Any) -> bool:
+    # A TOML integer may be too large for any float.
+    return (_is_whole(value) and abs(value) <= sys.float_info.max) or (
+        isinstance(value, float) and math.isfinite(value)
+    )
+
+
+def _are_numbers(count: int) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list) and len(value) == count and all(map(_is_number, value))
+
+
+def _are_whole(count: int) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list) and len(value) == count and all(map(_is_whole, value))

@@ -1,0 +1,86 @@
+"""Sizes as users write them, and the switches of ingest and casting with their defaults."""
+
+import math
+import re
+from dataclasses import dataclass
+
+from penumbra.errors import SceneError
+
+_UNIT_BYTES = {"": 1, "b": 1} | {
+    prefix + suffix: base**power
+    for power, prefix in enumerate("kmgt", start=1)
+    for suffix, base in (("b", 1000), ("ib", 1024))
+}
+_SIZE = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", re.IGNORECASE)
+
+
+def parse_size(text: str | int | None) -> int | None:
+    """Bytes of a size such as `512MiB` (2**20), `4GB` (10**9), `1.5GiB` or a plain number; None stays None.
+
+    Raises `SceneError` for anything else, and for sizes below one byte.
+    """
+    if text is None:
+        return None
+    match = _SIZE.fullmatch(str(text)) if not isinstance(text, bool | float) else None
+    unit_bytes = _UNIT_BYTES.get(match[2].lower()) if match else None
+    if match is None or unit_bytes is None:
+        raise SceneError(f"{text!r} is not a size: write a number of bytes, or one like 512MiB, 4GiB or 4GB")
+    size_bytes = int(match[1]) * unit_bytes if match[1].isdigit() else int(float(match[1]) * unit_bytes)
+    if size_bytes < 1:
+        raise SceneError(f"{text!r} is not a size: it must be at least one byte")
+    return size_bytes
+
+
+@dataclass(frozen=True)
+class IngestOptions:
+    """How triangles are laid out in a blocker store; no choice changes a bit of any mask."""
+
+    chunk_triangles: int = 65536
+    """Triangles in one chunk, the unit of reading."""
+    max_buckets: int = 16
+    """Most area buckets a store may have."""
+    sort: bool = True
+    """Sort by area and place; False keeps one bucket in input order, to measure what sorting gains."""
+
+    def __post_init__(self) -> None:
+        _at_least("chunk_triangles", self.chunk_triangles, 1)
+        _at_least("max_buckets", self.max_buckets, 1)
+
+
+@dataclass(frozen=True)
+class CastOptions:
+    """Switches of the casting engine (Laine & Aila 2005, sections 3.2 to 3.4); none changes a bit."""
+
+    umbra_bits: bool = True
+    """A: skip groups, receivers and nodes that are already fully in umbra."""
+    active_planes: bool = True
+    """B: while descending, test only the planes that a node still straddles."""
+    lazy_volumes: bool = True
+    """C: construct penumbra and hard shadow volumes when first needed."""
+    lazy_masks: bool = True
+    """D: allocate masks on demand and release them in full umbra."""
+    sort: bool = True
+    """Cast the buckets from large triangles to small; False takes them in stored order reversed."""
+    group_size: int = 32
+    """Light samples in one light sample group, 32 or 64."""
+    tile_receivers: int = 8192
+    """Receivers in one tile, the unit of work of a thread."""
+    leaf_receivers: int = 16
+    """Receivers in one leaf of the receiver BVH, at most."""
+    rebuild_fraction: float = 0.25
+    """Rebuild the receiver BVH once this fraction of its receivers is in umbra since it was built."""
+
+    def __post_init__(self) -> None:
+        if self.group_size not in (32, 64):
+            raise SceneError(f"group_size is {self.group_size}: a light sample group has 32 or 64 samples")
+        _at_least("tile_receivers", self.tile_receivers, 1)
+        _at_least("leaf_receivers", self.leaf_receivers, 1)
+        if not (math.isfinite(self.rebuild_fraction) and self.rebuild_fraction > 0):
+            raise SceneError(
+                f"rebuild_fraction is {self.rebuild_fraction}: it must be above 0 (1 or more: never rebuild)"
+            )
+
+
+def _at_least(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise SceneError(f"{name} is {value}: it must be at least {least}")

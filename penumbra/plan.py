@@ -1,0 +1,194 @@
+"""What a render will do and the memory it needs, before any work: pure integers from options and headers."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from penumbra.errors import MemoryLimitError
+from penumbra.film import Window, film_bytes
+from penumbra.memory import format_bytes
+
+BlockerSource = Literal["store", "memory", "temporary store"]
+
+# Bytes by the thing that is held; each was measured as the growth of VmHWM and rounded up.
+_GBUFFER_BYTES = 72  # a pixel's place in the G-buffer: pixel, point, normal, own triangle, depth
+_VISIBLE_BYTES = 112  # a pixel while visible points are found: z-buffer, ids, the batches of the G-buffer
+_CAST_BYTES = 144  # a receiver while it is cast: light space copy, hierarchy, order, facing state
+_SHADE_BYTES = 24  # a receiver while it is shaded and put on the film
+_MASK_WORD_BYTES = 8
+_PREVIEW_BYTES = 24  # a pixel while the picture is exposed
+_ENCODE_BYTES = 24 << 20  # buffers of the EXR encoder
+_STORE_BYTES = 48 << 20  # two chunks of 64 Ki blockers with boxes and reading buffers, the store's index
+_MEMORY_TRIANGLE_BYTES = 260  # a blocker while it is sorted in memory; 90 stay
+_KERNEL_BYTES = 96 << 20  # machine code and LLVM's own memory once every kernel is loaded
+_INGEST_LEAST_BYTES = 96 << 20
+_SCRATCH_TRIANGLE_BYTES = 2 * 84  # the store and, while it is made, its unsorted buckets
+
+_ROUND_BYTES = 16 << 20
+
+
+class LightPlan(NamedTuple):
+    """One light's samples."""
+
+    name: str
+    samples: int
+    sets: int
+
+
+class GeometryPlan(NamedTuple):
+    """What the headers of the geometry say."""
+
+    n_triangles: int
+    is_exact: bool
+    is_store: bool
+
+
+@dataclass(frozen=True)
+class RenderPlan:
+    """What a render will do; `str()` is what `--dry-run` prints."""
+
+    resolution: tuple[int, int]
+    window: Window
+    lights: tuple[LightPlan, ...]
+    geometry: GeometryPlan
+    source: BlockerSource
+    passes: tuple[Window, ...]
+    threads: int
+    limit_bytes: int
+    resident_bytes: int
+    kernel_bytes: int
+    film_bytes: int
+    blocker_bytes: int
+    pass_bytes: int
+    scratch_bytes: int
+
+    @property
+    def needed_bytes(self) -> int:
+        """Most resident memory that the process is planned to take."""
+        return (
+            self.resident_bytes + self.kernel_bytes + self.film_bytes + self.blocker_bytes + self.pass_bytes
+        )
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """What this scene does not need and the render therefore does not do."""
+        return tuple(
+            text
+            for applies, text in (
+                (self.source == "memory", "no store is written: all geometry fits in memory"),
+                (self.source == "store", "no ingest: the geometry is a blocker store"),
+                (len(self.passes) == 1, "no second pass: the receivers of the whole picture fit in memory"),
+                (len(self.lights) == 1, "no sum over lights: there is one"),
+                (all(light.sets == 1 for light in self.lights), "no choice of sample set: there is one"),
+            )
+            if applies
+        )
+
+    def __str__(self) -> str:
+        """Return the plan as lines of text."""
+        return "\n".join(f"{label:<11}{text}" for label, text in self._lines())
+
+    def _lines(self) -> list[tuple[str, str]]:
+        width, height = self.resolution
+        x0, y0, x1, y1 = self.window
+        rows = max((y1 - y0 for _, y0, _, y1 in self.passes), default=0)
+        about = "" if self.geometry.is_exact else "at most about "
+        parts = (
+            ("process", self.resident_bytes),
+            ("kernels", self.kernel_bytes),
+            ("film", self.film_bytes),
+            ("blockers", self.blocker_bytes),
+            ("one pass", self.pass_bytes),
+        )
+        lines = [
+            ("picture", f"{width} x {height}, window {x0} {y0} {x1} {y1}: {(x1 - x0) * (y1 - y0):,} pixels"),
+            *(("light", f"{name}: {samples} samples in {sets} sets") for name, samples, sets in self.lights),
+            ("blockers", f"{about}{self.geometry.n_triangles:,} triangles from {self.source}"),
+            ("passes", f"{len(self.passes)} of up to {rows} rows, {self.threads} threads"),
+            ("memory", " + ".join(f"{name} {format_bytes(size)}" for name, size in parts)),
+            ("needed", f"{format_bytes(self.needed_bytes)} of {format_bytes(self.limit_bytes)}"),
+            ("scratch", f"{format_bytes(self.scratch_bytes)} of disk" if self.scratch_bytes else "none"),
+        ]
+        return lines + [("left out", text) for text in self.left_out]
+
+
+def make_plan(
+    resolution: tuple[int, int],
+    window: Window,
+    lights: Sequence[LightPlan],
+    geometry: GeometryPlan,
+    limit_bytes: int,
+    resident_bytes: int,
+    threads: int,
+) -> RenderPlan:
+    """Choose where the blockers live and how many passes there are.
+
+    `limit_bytes` is of the whole process, of which `resident_bytes` are taken before the render begins.
+    Raises MemoryLimitError when not even one row of pixels fits; the message has a limit that would do.
+    """
+    film = film_bytes(window, len(lights))
+    free = limit_bytes - resident_bytes - _KERNEL_BYTES - film
+    n_words = max(-(-light.samples // 64) for light in lights)
+    row_bytes = (window[2] - window[0]) * _pixel_bytes(n_words)
+    # The picture is exposed and encoded when no pass is in memory, but both come out of the same limit.
+    after_bytes = _ENCODE_BYTES + (window[2] - window[0]) * (window[3] - window[1]) * _PREVIEW_BYTES
+    least_pass_bytes = max(row_bytes, after_bytes)
+    source, blocker_bytes = _place_blockers(geometry, free, least_pass_bytes)
+    rows = (free - blocker_bytes) // row_bytes
+    if free < blocker_bytes + least_pass_bytes:
+        least = limit_bytes - free + blocker_bytes + least_pass_bytes
+        raise MemoryLimitError(_refusal(resolution, window, n_words, limit_bytes, least))
+    passes = _bands(window, rows)
+    return RenderPlan(
+        resolution=resolution,
+        window=window,
+        lights=tuple(lights),
+        geometry=geometry,
+        source=source,
+        passes=passes,
+        threads=threads,
+        limit_bytes=limit_bytes,
+        resident_bytes=resident_bytes,
+        kernel_bytes=_KERNEL_BYTES,
+        film_bytes=film,
+        blocker_bytes=blocker_bytes,
+        pass_bytes=max(max(y1 - y0 for _, y0, _, y1 in passes) * row_bytes, after_bytes),
+        scratch_bytes=geometry.n_triangles * _SCRATCH_TRIANGLE_BYTES if source == "temporary store" else 0,
+    )
+
+
+def _pixel_bytes(n_words: int) -> int:
+    """Memory of one pixel of a pass: finding visible points and casting them follow each other."""
+    casting = n_words * _MASK_WORD_BYTES + max(_CAST_BYTES, _SHADE_BYTES)
+    return _GBUFFER_BYTES + max(_VISIBLE_BYTES, casting)
+
+
+def _place_blockers(geometry: GeometryPlan, free: int, least_pass_bytes: int) -> tuple[BlockerSource, int]:
+    """Where the blockers are read from, and the memory that takes, of `free` bytes for them and a pass."""
+    if geometry.is_store:
+        return "store", _STORE_BYTES
+    # Half of what is free: the other half makes the passes few.
+    in_memory = geometry.n_triangles * _MEMORY_TRIANGLE_BYTES
+    if in_memory <= min(free // 2, free - least_pass_bytes):
+        return "memory", in_memory
+    return "temporary store", max(_STORE_BYTES, _INGEST_LEAST_BYTES)
+
+
+def _bands(window: Window, rows: int) -> tuple[Window, ...]:
+    """Cut the window into bands of at most `rows` rows, as even as can be."""
+    x0, y0, x1, y1 = window
+    n_bands = math.ceil((y1 - y0) / rows)
+    edges = [y0 + (y1 - y0) * band // n_bands for band in range(n_bands + 1)]
+    return tuple((x0, first, x1, last) for first, last in zip(edges, edges[1:], strict=False))
+
+
+def _refusal(resolution: tuple[int, int], window: Window, n_words: int, limit: int, least: int) -> str:
+    width, height = resolution
+    # Rounded up with some slack: what is resident before the render differs from run to run.
+    enough = (least + least // 50 + _ROUND_BYTES) // _ROUND_BYTES * _ROUND_BYTES
+    return (
+        f"a picture of {window[2] - window[0]} x {window[3] - window[1]} pixels (of {width} x {height}) "
+        f"with up to {64 * n_words} light samples does not fit the memory limit of {format_bytes(limit)}: "
+        f"give {enough >> 20}MiB or more, or render a smaller --crop"
+    )

@@ -1,0 +1,297 @@
+"""The story of a render, from scene file to OpenEXR image; the calls stand in the order of the stages."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+from penumbra.api import backend_named
+from penumbra.arrays import Receivers
+from penumbra.blockers import Blockers
+from penumbra.errors import SceneError
+from penumbra.executors.threads import resolve_threads
+from penumbra.film import LIGHT_LAYERS, Film, Window
+from penumbra.image import Image, header_attributes
+from penumbra.ingest import blockers_in_memory, ingest
+from penumbra.io.atomic import temporary_folder
+from penumbra.io.blocker_store import open_store
+from penumbra.io.exr import camera_attributes
+from penumbra.io.meshes import open_mesh
+from penumbra.memory import call_limit_bytes, resident_bytes
+from penumbra.options import CastOptions, parse_size
+from penumbra.outputs import Outputs, finished_image
+from penumbra.plan import GeometryPlan, LightPlan, RenderPlan, make_plan
+from penumbra.progress import NullProgress, Progress
+from penumbra.scene import Scene
+from penumbra.settings import Settings, settings_of
+from penumbra.shading import Shading, shade
+from penumbra.stats import Stats
+from penumbra.visible import GBuffer, find_visible
+
+SceneLike = Scene | str | Path
+PathLike = str | Path
+
+# A face of an OBJ file with its share of the vertices takes 20 bytes at least, binary formats less.
+_LEAST_TRIANGLE_BYTES = 12
+
+
+def render(
+    scene: SceneLike,
+    output: PathLike | None = None,
+    *,
+    memory: int | str | None = None,
+    backend: str = "hpc",
+    threads: int = 0,
+    crop: Window | None = None,
+    seed: int | None = None,
+    samples: int | None = None,
+    resolution: tuple[int, int] | None = None,
+    preview: PathLike | None = None,
+    stats: PathLike | None = None,
+    scratch: PathLike | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    process_limit: bool = False,
+) -> Image:
+    """Render a scene with exact soft shadows, and write it if `output` is given.
+
+    Parameters
+    ----------
+    scene
+        A Scene, or the path of a scene file.
+    output, preview, stats
+        Files to write: OpenEXR, an exposed PNG, counters and seconds as JSON.
+    memory
+        Bytes that this call may add to the resident memory, or a size such as "2GiB"; None is half of the
+        free memory. With `process_limit` the limit is of the whole process.
+    backend
+        "hpc", "reference" or "auto"; all give the same bits.
+    threads
+        0 for all cores.
+    crop
+        (x0, y0, x1, y1), half-open, from the upper left: exactly these pixels of the full picture.
+    seed, samples, resolution
+        In place of the scene's, for every light.
+    scratch
+        Folder of the temporary store of geometry that does not fit in memory; beside `output` by default.
+    resume
+        Do nothing when `output` is there and was rendered with the same settings.
+    overwrite
+        Replace `output` if it is there.
+
+    Raises
+    ------
+    SceneError, MeshError, BlockerStoreError
+        Input that cannot be used.
+    OutputError
+        An output that is there already, or cannot be written.
+    MemoryLimitError
+        The limit cannot be met; the message has one that would do. Nothing has been done by then.
+    BackendError
+        There is no such backend.
+    """
+    progress = progress or NullProgress()
+    scene, window = _effective_scene(scene, crop, seed, samples, resolution)
+    settings = settings_of(scene, window)
+    outputs = _checked_outputs(scene, output, preview, stats)
+    if resume and not overwrite and outputs.image is not None and outputs.image.exists():
+        return finished_image(outputs.image, settings)
+    outputs.refuse_existing(overwrite)
+    cast_receivers = backend_named(backend)
+    plan = _make_plan(scene, window, memory, process_limit, threads)
+    run = Stats(backend)
+    film = Film(*plan.resolution, window, [light.name for light in scene.lights])
+    with _open_blockers(scene, plan, outputs.scratch_parent(scratch), run, progress) as blockers:
+        for band in plan.passes:
+            seen = _see(scene, blockers, band, plan.threads, run, progress)
+            _put_geometry(film, seen)
+            receivers = Receivers(seen.points, seen.normals, seen.own, seen.pixel)
+            for light in scene.lights:
+                masks, sample_sets, cast_stats = cast_receivers(
+                    receivers, blockers, light, options=CastOptions(), threads=plan.threads, progress=progress
+                )
+                run.merge(cast_stats)
+                with run.timed("shade"):
+                    shading = shade(seen.points, seen.normals, sample_sets, masks, light, plan.threads)
+                    _put_shading(film, light.name, seen, shading)
+    image = _develop(film, scene, settings, plan, run)
+    progress.stage("write", None, "")
+    with run.timed("write"):
+        outputs.write(image, plan.threads)
+    outputs.write_numbers(_numbers(image, plan))
+    return image
+
+
+def plan_render(
+    scene: SceneLike,
+    output: PathLike | None = None,
+    *,
+    memory: int | str | None = None,
+    backend: str = "hpc",
+    threads: int = 0,
+    crop: Window | None = None,
+    seed: int | None = None,
+    samples: int | None = None,
+    resolution: tuple[int, int] | None = None,
+    preview: PathLike | None = None,
+    stats: PathLike | None = None,
+    scratch: PathLike | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    process_limit: bool = False,
+) -> RenderPlan:
+    """Return what `render` with the same arguments would do, and do nothing; `str()` of it is for people.
+
+    Raises what `render` would raise before its work begins, but for outputs that are there already.
+    """
+    scene, window = _effective_scene(scene, crop, seed, samples, resolution)
+    _checked_outputs(scene, output, preview, stats)
+    backend_named(backend)
+    return _make_plan(scene, window, memory, process_limit, threads)
+
+
+def visible_points(scene: SceneLike, threads: int = 0, progress: Progress | None = None) -> GBuffer:
+    """Return the receivers of a scene's whole picture, exactly those that `render` casts."""
+    progress = progress or NullProgress()
+    scene, window = _effective_scene(scene, None, None, None, None)
+    plan = _make_plan(scene, window, None, False, threads)
+    run = Stats("")
+    scratch = Outputs(None, None, None).scratch_parent(None)
+    with _open_blockers(scene, plan, scratch, run, progress) as blockers:
+        return find_visible(blockers, scene.camera, window, threads=plan.threads, progress=progress)
+
+
+def _effective_scene(
+    scene: SceneLike,
+    crop: Window | None,
+    seed: int | None,
+    samples: int | None,
+    resolution: tuple[int, int] | None,
+) -> tuple[Scene, Window]:
+    """Load the scene if it is a path, apply what the caller overrides, and check the crop."""
+    loaded = scene if isinstance(scene, Scene) else Scene.load(scene)
+    loaded = loaded.with_overrides(resolution=resolution, samples=samples, seed=seed)
+    for mesh in loaded.geometry:
+        if not mesh.path.is_file():
+            raise SceneError(f"{mesh.path}: no such file; check the path in {loaded.path or 'the scene'}")
+        if mesh.is_store and len(loaded.geometry) > 1:
+            raise SceneError(
+                f"{mesh.path} is a blocker store, which must be the only geometry: "
+                "ingest all meshes into one store"
+            )
+    width, height = loaded.camera.resolution
+    window = (0, 0, width, height) if crop is None else tuple(int(edge) for edge in crop)
+    x0, y0, x1, y1 = window
+    if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
+        raise SceneError(
+            f"crop {x0} {y0} {x1} {y1} is not a part of the picture: "
+            f"it needs 0 <= X0 < X1 <= {width} and 0 <= Y0 < Y1 <= {height}"
+        )
+    return loaded, (x0, y0, x1, y1)
+
+
+def _checked_outputs(
+    scene: Scene, output: PathLike | None, preview: PathLike | None, stats: PathLike | None
+) -> Outputs:
+    outputs = Outputs(*(None if path is None else Path(path) for path in (output, preview, stats)))
+    outputs.check([mesh.path for mesh in scene.geometry] + ([scene.path] if scene.path else []))
+    return outputs
+
+
+def _make_plan(
+    scene: Scene, window: Window, memory: int | str | None, process_limit: bool, threads: int
+) -> RenderPlan:
+    resident = resident_bytes()
+    return make_plan(
+        scene.camera.resolution,
+        window,
+        [LightPlan(light.name, light.samples, light.sets) for light in scene.lights],
+        _measure_geometry(scene),
+        limit_bytes=resident + call_limit_bytes(parse_size(memory), process_limit),
+        resident_bytes=resident,
+        threads=resolve_threads(threads),
+    )
+
+
+def _measure_geometry(scene: Scene) -> GeometryPlan:
+    """Count triangles from the headers; where a format has none, take the most that the file can hold."""
+    if scene.geometry[0].is_store:
+        with closing(open_store(scene.geometry[0].path)) as store:
+            return GeometryPlan(store.n_triangles, is_exact=True, is_store=True)
+    n_triangles, is_exact = 0, True
+    for mesh in scene.geometry:
+        with open_mesh(mesh.path) as reader:
+            if reader.n_triangles is None:
+                is_exact = False
+                n_triangles += reader.size_bytes // _LEAST_TRIANGLE_BYTES
+            else:
+                n_triangles += reader.n_triangles
+    return GeometryPlan(n_triangles, is_exact, is_store=False)
+
+
+@contextmanager
+def _open_blockers(
+    scene: Scene, plan: RenderPlan, scratch: Path, run: Stats, progress: Progress
+) -> Iterator[Blockers]:
+    """Open the store, or make the blockers: in memory, or in a store that is removed afterwards."""
+    with ExitStack() as stack:
+        with run.timed("ingest"):
+            blockers: Blockers
+            if plan.source == "store":
+                blockers = open_store(scene.geometry[0].path)
+            elif plan.source == "memory":
+                blockers = blockers_in_memory(scene.geometry, progress=progress)
+            else:
+                folder = stack.enter_context(temporary_folder(scratch))
+                limit = plan.limit_bytes - plan.resident_bytes
+                blockers = ingest(
+                    scene.geometry, folder / "blockers.h5", memory=limit, scratch=folder, progress=progress
+                )
+            stack.callback(blockers.close)
+        run.count("n_triangles", blockers.n_triangles)
+        run.count("n_dropped", blockers.n_dropped)
+        yield blockers
+
+
+def _see(
+    scene: Scene, blockers: Blockers, band: Window, threads: int, run: Stats, progress: Progress
+) -> GBuffer:
+    with run.timed("visible"):
+        seen = find_visible(
+            blockers, scene.camera, band, threads=threads, progress=progress, counters=run.counters
+        )
+    run.count("n_receivers", len(seen.pixel))
+    return seen
+
+
+def _put_geometry(film: Film, seen: GBuffer) -> None:
+    film.put("Z", seen.pixel, seen.depth)
+    film.put("id", seen.pixel, seen.own)
+    film.put_xyz("P", seen.pixel, seen.points)
+    film.put_xyz("N", seen.pixel, seen.normals)
+
+
+def _put_shading(film: Film, light: str, seen: GBuffer, shading: Shading) -> None:
+    for layer in LIGHT_LAYERS:
+        film.put(f"{light}.{layer}", seen.pixel, getattr(shading, layer))
+    film.add_direct_light(seen.pixel, shading.irradiance)
+
+
+def _develop(film: Film, scene: Scene, settings: Settings, plan: RenderPlan, run: Stats) -> Image:
+    attributes = header_attributes(settings, run, plan)
+    attributes |= camera_attributes(scene.camera.frame(), scene.camera.resolution)
+    return Image(film.layers, run, plan.resolution, plan.window, attributes)
+
+
+def _numbers(image: Image, plan: RenderPlan) -> dict[str, Any]:
+    """Return the content of the stats file: everything counted, and what the picture was."""
+    return image.stats.as_dict() | {
+        "resolution": list(plan.resolution),
+        "window": list(plan.window),
+        "passes": len(plan.passes),
+        "threads": plan.threads,
+        "blockers": plan.source,
+        "planned_bytes": plan.needed_bytes,
+        "settings_hash": image.attributes["penumbra:settings_hash"],
+    }

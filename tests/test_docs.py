@@ -1,0 +1,72 @@
+"""The documentation keeps up with the program: commands, options, keys, links."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import click
+import pytest
+
+from penumbra.cli.main import cli
+from penumbra.io.scene_file import TABLE_KEYS
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+COMMAND_LINE = (ROOT / "docs" / "command-line.md").read_text()
+SCENE_FILE = (ROOT / "docs" / "scene-file.md").read_text()
+
+_LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
+_MACHINE_PATH = re.compile(r"(?<![\w./~])/(?:work|tmp|home|root|Users|usr)/")
+
+
+@pytest.mark.parametrize("name", cli.commands)
+def test_every_command_is_explained(name: str) -> None:
+    command = cli.commands[name]
+    assert command.help and f"Example: penumbra {name}" in command.help
+    assert f"## penumbra {name}" in COMMAND_LINE
+    section = COMMAND_LINE.split(f"## penumbra {name}", 1)[1].split("\n## ", 1)[0]
+    for option in command.params:
+        if isinstance(option, click.Option) and not {"-q", "-v"} & set(option.opts):
+            assert option.help, option.name
+            assert f"`{max(option.opts, key=len)}" in section, f"{name}: {option.opts} is not in its section"
+
+
+@pytest.mark.parametrize("kind", TABLE_KEYS)
+def test_every_key_of_a_scene_file_is_explained(kind: str) -> None:
+    section = SCENE_FILE.split(f"[{kind}]", 1)[1]
+    for key in TABLE_KEYS[kind]:
+        assert f"`{key}`" in section
+
+
+def test_scene_files_in_the_documentation_are_read(square_obj: Path, tmp_path: Path) -> None:
+    from penumbra.scene import Scene
+
+    blocks = re.findall(r"```toml\n(.*?)```", SCENE_FILE, re.DOTALL)
+    assert blocks
+    for block in blocks:
+        for entry in tomllib.loads(block)["geometry"]:
+            (tmp_path / entry["path"]).write_bytes(square_obj.read_bytes())
+        (tmp_path / "scene.toml").write_text(block)
+        assert Scene.load(tmp_path / "scene.toml").lights
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_lead_somewhere(page: Path) -> None:
+    targets = [
+        link for link in _LINK.findall(page.read_text()) if "://" not in link and "mailto:" not in link
+    ]
+    missing = [target for target in targets if not (page.parent / target).exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_no_page_speaks_of_one_machine(page: Path) -> None:
+    assert not _MACHINE_PATH.search(page.read_text())
+
+
+def test_two_commands_are_enough() -> None:
+    readme, makefile = (ROOT / "README.md").read_text(), (ROOT / "Makefile").read_text()
+    for target in ("demo", "test"):
+        assert f"make {target}" in readme
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+    assert "make test" in (ROOT / ".ci" / "run").read_text()

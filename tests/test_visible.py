@@ -1,0 +1,406 @@
+"""Primary visibility against exact rationals, closed rooms, Embree, and itself under other orders."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from fractions import Fraction
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from paths import scene_file
+
+from penumbra.arrays import BlockerChunk, ChunkInfo, Float64Array, Int64Array
+from penumbra.errors import SceneError
+from penumbra.scene import Camera, CameraFrame
+from penumbra.visible import GBuffer, find_visible, make_view, may_be_seen, window_bytes
+
+Vector = tuple[Fraction, Fraction, Fraction]
+
+
+class ListBlockers:
+    """Triangles in any order and any chunking, without an ingest."""
+
+    def __init__(self, triangles: NDArray, ids: Sequence[int] | None = None, chunk: int = 1000) -> None:
+        self.triangles = np.array(triangles, dtype=np.float64).reshape(-1, 3, 3)
+        self.ids = np.arange(len(self.triangles)) if ids is None else np.array(ids, dtype=np.int64)
+        self.n_triangles, self.n_dropped = len(self.triangles), 0
+        self.n_bytes = self.triangles.nbytes
+        corners = self.triangles.reshape(-1, 3)
+        self.bounds = np.stack([corners.min(0), corners.max(0)]) if len(corners) else np.zeros((2, 3))
+        self.chunks = []
+        self.read_chunks: list[int] = []
+        for first in range(0, len(self.triangles), chunk):
+            part = self.triangles[first : first + chunk]
+            box = np.stack([part.min((0, 1)), part.max((0, 1))])
+            self.chunks.append(ChunkInfo(0, first, len(part), part.nbytes, box))
+
+    def read(self, i: int) -> BlockerChunk:
+        self.read_chunks.append(i)
+        part = slice(self.chunks[i].first, self.chunks[i].first + self.chunks[i].count)
+        none = np.zeros((0, 2, 3))
+        return BlockerChunk(self.triangles[part], self.ids[part], none, none, none)
+
+    def close(self) -> None:
+        return
+
+
+def exact(values: Sequence[float]) -> Vector:
+    x, y, z = (Fraction(float(value)) for value in values)
+    return x, y, z
+
+
+def minus(a: Vector, b: Vector) -> Vector:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def dot(a: Vector, b: Vector) -> Fraction:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def hit_parameter(triangle: Sequence[Vector], eye: Vector, ray: Vector) -> Fraction | None:
+    """Where the ray from the eye meets the closed triangle, by solving for plane and sides one by one."""
+    a, b, c = triangle
+    normal = cross(minus(b, a), minus(c, a))
+    height, slope = dot(minus(a, eye), normal), dot(ray, normal)
+    if height == 0 or slope == 0 or height / slope <= 0:
+        return None
+    t = height / slope
+    hit = (eye[0] + t * ray[0], eye[1] + t * ray[1], eye[2] + t * ray[2])
+    for start, end in ((a, b), (b, c), (c, a)):
+        if dot(cross(minus(end, start), minus(hit, start)), normal) < 0:
+            return None
+    return t
+
+
+def ray_of(frame: CameraFrame, x: int, y: int) -> Vector:
+    q = frame.eye + ((frame.d0 + y * frame.dy) + x * frame.dx)
+    return minus(exact(q), exact(frame.eye))
+
+
+def seen_exactly(triangles: Float64Array, ids: Sequence[int], frame: CameraFrame, x: int, y: int) -> int:
+    """The index of the triangle that pixel (x, y) sees, -1 for none."""
+    eye, ray = exact(frame.eye), ray_of(frame, x, y)
+    hits = [
+        (t, int(index))
+        for triangle, index in zip(triangles, ids, strict=True)
+        if (t := hit_parameter([exact(v) for v in triangle], eye, ray)) is not None
+    ]
+    return min(hits)[1] if hits else -1
+
+
+def exact_camera(
+    eye: Sequence[float], width: int = 9, height: int = 7, step: float = 0.25
+) -> SimpleNamespace:
+    """Looks along -z; all of its rays, and eye + ray for small whole numbers, are exact in float64."""
+    d0 = np.array([-(width - 1) / 2 * step, (height - 1) / 2 * step, -1.0])
+    frame = CameraFrame(
+        np.array(eye, dtype=np.float64),
+        d0,
+        np.array([step, 0.0, 0.0]),
+        np.array([0.0, -step, 0.0]),
+        np.array([0.0, 0.0, -1.0]),
+    )
+    return SimpleNamespace(resolution=(width, height), frame=lambda: frame)
+
+
+def full(camera) -> tuple[int, int, int, int]:
+    return (0, 0, *camera.resolution)
+
+
+def own_picture(buffer: GBuffer, camera) -> Int64Array:
+    """(height, width) triangle index, -1 for background."""
+    width, height = camera.resolution
+    picture = np.full(width * height, -1, dtype=np.int64)
+    picture[buffer.pixel] = buffer.own
+    return picture.reshape(height, width)
+
+
+def assert_exact(triangles: Float64Array, camera, ids: Sequence[int] | None = None, **options) -> GBuffer:
+    blockers = ListBlockers(triangles, ids, options.pop("chunk", 1000))
+    buffer = find_visible(blockers, camera, full(camera), **options)
+    width, height = camera.resolution
+    expected = [
+        [seen_exactly(blockers.triangles, blockers.ids, camera.frame(), x, y) for x in range(width)]
+        for y in range(height)
+    ]
+    np.testing.assert_array_equal(own_picture(buffer, camera), expected)
+    assert_receivers(buffer, blockers, camera)
+    return buffer
+
+
+def assert_receivers(buffer: GBuffer, blockers: ListBlockers, camera, stride: int = 1) -> None:
+    """Receivers are just in front of their triangles, on the pixel's ray, with the normal to the eye."""
+    frame = camera.frame()
+    eye = exact(frame.eye)
+    by_id = {int(index): triangle for index, triangle in zip(blockers.ids, blockers.triangles, strict=True)}
+    assert (np.diff(buffer.pixel) > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(buffer.normals, axis=1), 1.0, rtol=1e-15)
+    np.testing.assert_allclose(buffer.depth, (buffer.points - frame.eye) @ frame.forward, rtol=1e-12)
+    for row in range(0, len(buffer.pixel), stride):
+        a, b, c = corners = [exact(v) for v in by_id[int(buffer.own[row])]]
+        normal = cross(minus(b, a), minus(c, a))
+        side = 1 if dot(minus(eye, a), normal) > 0 else -1
+        point = exact(buffer.points[row])
+        above = side * dot(minus(point, a), normal)
+        length = Fraction(float(np.sqrt(float(dot(normal, normal)))))
+        size = max(abs(x) for v in (*corners, eye) for x in v)
+        assert above > 0
+        assert above <= Fraction(1, 10**13) * length * size
+        assert side * dot(exact(buffer.normals[row]), normal) > 0
+        y, x = divmod(int(buffer.pixel[row]), camera.resolution[0])
+        ray = ray_of(frame, x, y)
+        t = hit_parameter(corners, eye, ray)
+        assert t is not None
+        hit = np.array([float(e + t * r) for e, r in zip(eye, ray, strict=True)])
+        assert np.abs(buffer.points[row] - hit).max() <= 1e-8 * float(size)
+
+
+whole = st.integers(-4, 4)
+corner = st.tuples(whole, whole, whole)
+
+
+def has_area(triangle: Sequence[Sequence[int]]) -> bool:
+    a, b, c = (exact(v) for v in triangle)
+    return any(cross(minus(b, a), minus(c, a)))
+
+
+grid_triangles = st.lists(st.tuples(corner, corner, corner).filter(has_area), min_size=1, max_size=12)
+
+
+@settings(max_examples=40)
+@given(grid_triangles, corner, st.integers(1, 5), st.randoms(use_true_random=False))
+def test_grid_scenes_equal_the_rational_oracle(triangles, eye, chunk, random):
+    # Whole numbers: rays through edges and corners, shared edges, edge-on and coplanar triangles,
+    # duplicates, triangles through the plane of the eye and behind it.
+    ids = list(range(len(triangles)))
+    random.shuffle(ids)
+    assert_exact(np.array(triangles, dtype=np.float64), exact_camera(eye), ids, chunk=chunk)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_scenes_at_any_scale_and_offset(rng, scale, offset):
+    for _ in range(3):
+        triangles = rng.normal(size=(25, 1, 3)) + rng.normal(size=(25, 3, 3)) * rng.choice([0.1, 1.0, 3.0])
+        # Squares of two triangles: shared edges that no pixel may slip through, or see twice.
+        triangles[1::2, 0], triangles[1::2, 1] = triangles[:-1:2, 2], triangles[:-1:2, 1]
+        move = offset * np.array([1.0, -0.7, 0.3])
+        camera = Camera(
+            tuple(np.array([0.3, 0.2, 2.5]) * scale + move), tuple(move), vfov=60, resolution=(11, 8)
+        )
+        assert_exact(triangles * scale + move, camera, chunk=7)
+
+
+@pytest.mark.parametrize("power", [-700, -400, 300, 340, 400])
+def test_numbers_that_overflow_or_underflow(rng, power):
+    triangles = np.ldexp(rng.integers(-6, 7, size=(15, 3, 3)).astype(np.float64), power)
+    keep = [t for t in triangles if has_area(t)]
+    camera = exact_camera([0, 0, 0])
+    blockers = ListBlockers(keep)
+    picture = own_picture(find_visible(blockers, camera, full(camera)), camera)
+    frame = camera.frame()
+    expected = [[seen_exactly(keep, blockers.ids, frame, x, y) for x in range(9)] for y in range(7)]
+    np.testing.assert_array_equal(picture, expected)
+
+
+def test_coplanar_surfaces_show_the_lowest_index(rng):
+    # Two large triangles of one skew plane whose float64 depths differ in rounding, and a third in the
+    # other winding; the lower index must win wherever they overlap.
+    u, v = np.array([3.0, 1.0, -2.0]), np.array([-1.0, 3.0, 1.0])
+    origin = np.array([0.0, 0.0, -7.0])
+    weights = np.array(
+        [[[-9, -5], [8, -7], [1, 9]], [[-7, 6], [9, 3], [-2, -9]], [[0, 8], [-8, -6], [9, -5]]]
+    )
+    triangles = origin + np.array(weights) @ np.stack([u, v])
+    camera = exact_camera([0, 0, 0], 17, 13, 0.125)
+    for ids in ([0, 1, 2], [2, 0, 1], [1, 2, 0]):
+        for chunk in (1, 3):
+            assert_exact(triangles, camera, ids, chunk=chunk)
+
+
+def test_duplicates_in_any_winding_show_the_lowest_index(rng):
+    mesh = trimesh.creation.icosphere(subdivisions=2).triangles
+    flipped = mesh[:, [1, 0, 2]]
+    camera = Camera((0.3, 0.4, 3.0), (0, 0, 0), resolution=(40, 30))
+    n = len(mesh)
+    blockers = ListBlockers(np.concatenate([mesh, flipped]), [*range(n, 2 * n), *range(n)], chunk=100)
+    buffer = find_visible(blockers, camera, full(camera))
+    assert len(buffer.own) > 100
+    assert buffer.own.max() < n
+
+
+def room(rng, scale: float, offset: float) -> Float64Array:
+    """A rotated box, split into many uneven triangles, seen from inside."""
+    box = trimesh.creation.box(extents=(4, 3, 5)).subdivide_loop(0).subdivide().subdivide()
+    turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
+    return np.asarray(box.triangles @ turn.T * scale + offset, dtype=np.float64)
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1e-6, 0.0), (1e6, 0.0), (1.0, 1e6), (1e-3, 1e5)])
+def test_closed_room_has_no_holes(rng, scale, offset):
+    triangles = room(rng, scale, offset)
+    for target in rng.normal(size=(4, 3)):
+        eye = tuple(np.full(3, offset) + scale * rng.uniform(-1, 1, 3))
+        camera = Camera(eye, tuple(np.array(eye) + target), up=(0.1, 1, 0.3), vfov=100, resolution=(160, 120))
+        buffer = find_visible(ListBlockers(triangles), camera, full(camera))
+        assert len(buffer.pixel) == 160 * 120
+        inside = (buffer.points - np.array(eye)) * buffer.normals
+        assert (inside.sum(axis=1) < 0).all()
+
+
+def test_picture_depends_on_no_order_chunk_thread_or_window(rng):
+    triangles = rng.normal(size=(900, 1, 3)) * 2 + rng.normal(size=(900, 3, 3)) * 0.3
+    triangles[::7, 1] *= 20
+    camera = Camera((0.1, 0.2, 4), (0, 0, 0), vfov=70, resolution=(150, 140))
+    whole_picture = find_visible(ListBlockers(triangles), camera, full(camera))
+    order = rng.permutation(len(triangles))
+    for chunk, threads in ((1000, 2), (64, 1), (17, 2)):
+        other = find_visible(
+            ListBlockers(triangles[order], order, chunk), camera, full(camera), threads=threads
+        )
+        for field, expected in zip(other, whole_picture, strict=True):
+            np.testing.assert_array_equal(field, expected)
+    rows = [find_visible(ListBlockers(triangles), camera, (0, y, 150, y + 35)) for y in range(0, 140, 35)]
+    for name in GBuffer._fields:
+        glued = np.concatenate([getattr(part, name) for part in rows])
+        np.testing.assert_array_equal(glued, getattr(whole_picture, name))
+    crop = find_visible(ListBlockers(triangles), camera, (31, 40, 77, 111))
+    y, x = np.divmod(whole_picture.pixel, 150)
+    inside = (x >= 31) & (x < 77) & (y >= 40) & (y < 111)
+    for field, expected in zip(crop, whole_picture, strict=True):
+        np.testing.assert_array_equal(field, expected[inside])
+
+
+def test_chunks_outside_the_view_are_not_read(rng):
+    near = rng.normal(size=(50, 3, 3)) * 0.3
+    away = [near + np.array(v) for v in ([0, 0, 40], [60, 0, 0], [-60, 0, 0], [0, 60, 0], [0, -60, 0])]
+    blockers = ListBlockers(np.concatenate([near, *away]), chunk=50)
+    camera = Camera((0, 0, 5), (0, 0, 0), resolution=(32, 24))
+    counters: dict[str, int] = {}
+    buffer = find_visible(blockers, camera, full(camera), counters=counters)
+    assert blockers.read_chunks == [0]
+    assert counters["bytes_read"] == near.nbytes
+    assert counters["bytes_skipped"] == 5 * near.nbytes
+    assert 0 < counters["triangles_rasterised"] <= 50
+    assert counters["pixels_tested"] >= len(buffer.pixel)
+    alone = find_visible(ListBlockers(near), camera, full(camera))
+    for field, expected in zip(buffer, alone, strict=True):
+        np.testing.assert_array_equal(field, expected)
+
+
+def test_boxes_that_are_seen_are_never_skipped(rng):
+    camera = Camera((0.2, -0.3, 1.0), (0, 0, 0), vfov=50, resolution=(64, 48))
+    window = (10, 20, 40, 41)
+    view = make_view(camera.frame(), camera.resolution, window)
+    skipped = 0
+    for _ in range(300):
+        box = np.sort(rng.normal(size=(2, 3)) * 2, axis=0)
+        if not may_be_seen(box, view):
+            skipped += 1
+            mesh = trimesh.creation.box(bounds=box).triangles
+            assert len(find_visible(ListBlockers(mesh), camera, window).pixel) == 0
+    assert skipped > 50
+
+
+def test_needles_and_nearly_edge_on_triangles(rng):
+    along = rng.normal(size=(40, 3))
+    start = rng.normal(size=(40, 3)) * 0.2
+    needles = np.stack([start, start + along * 1e-9 * rng.normal(size=(40, 1)), start + along * 3], axis=1)
+    needles[:, 1] += rng.normal(size=(40, 3)) * 1e-9
+    floor = np.array([[[-50, 1e-9, 40], [50, 1e-9, 40], [0, -1e-9, -50]]]) + np.array([0, 2.0, 0])
+    camera = Camera((0, 2.0, 3), (0, 2.0, 0), resolution=(64, 1), vfov=1e-3)
+    buffer = find_visible(ListBlockers(floor), camera, full(camera))
+    assert np.isfinite(buffer.points).all() and np.isfinite(buffer.normals).all()
+    assert_exact(needles, Camera((0, 0, 4), (0, 0, 0), resolution=(24, 16)))
+    # A needle is seldom hit; looking straight at one gives its normal to full precision all the same.
+    for needle in needles[:8]:
+        middle = needle.mean(axis=0)
+        camera = Camera(
+            tuple(middle + np.array([0.1, 0.2, 3.0])), tuple(middle), vfov=1e-7, resolution=(3, 3)
+        )
+        buffer = find_visible(ListBlockers(needle[None]), camera, full(camera))
+        for normal in buffer.normals:
+            edges = needle[[1, 2, 0]] - needle
+            lengths = np.linalg.norm(edges, axis=1)
+            assert np.abs(edges @ normal / lengths).max() < 1e-6
+
+
+def test_nothing_to_see():
+    camera = Camera((0, 0, 5), (0, 0, 0), resolution=(8, 6))
+    assert [
+        len(field) for field in find_visible(ListBlockers(np.zeros((0, 3, 3))), camera, full(camera))
+    ] == [0] * 5
+    triangle = np.array([[[0, 0, 9.0], [1, 0, 9], [0, 1, 9]]])
+    assert len(find_visible(ListBlockers(triangle), camera, full(camera)).pixel) == 0
+    assert len(find_visible(ListBlockers(triangle - [0, 0, 9]), camera, (3, 2, 3, 4)).pixel) == 0
+
+
+def test_bad_windows_and_cameras_are_refused():
+    blockers = ListBlockers(np.ones((1, 3, 3)))
+    camera = Camera((0, 0, 5), (0, 0, 0), resolution=(8, 6))
+    for window in ((0, 0, 9, 6), (-1, 0, 8, 6), (5, 0, 4, 6)):
+        with pytest.raises(SceneError, match="is not inside the picture of 8 x 6"):
+            find_visible(blockers, camera, window)
+    far = Camera((1e14, 0, 5), (0, 0, 0), vfov=1.0, resolution=(8, 6))
+    with pytest.raises(SceneError, match="cannot tell its pixels apart"):
+        find_visible(blockers, far, full(far))
+
+
+def test_window_bytes_cover_what_a_full_window_holds(rng):
+    camera = Camera((0, 0, 0), (0, 0, -1), resolution=(200, 150))
+    buffer = find_visible(ListBlockers(room(rng, 1.0, 0.0)), camera, full(camera))
+    assert len(buffer.pixel) == 200 * 150
+    assert sum(field.nbytes for field in buffer) < window_bytes(200, 150) < 200 * 150 * 150
+
+
+# Embree sets flush-to-zero in the threads of its process, so it gets a process of its own.
+_EMBREE = """
+import json, sys
+import numpy as np, trimesh
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+mesh = trimesh.load(sys.argv[1], process=False)
+rays = np.load(sys.argv[2])
+origins = rays[:1].repeat(len(rays) - 1, 0)
+first = RayMeshIntersector(mesh, scale_to_box=False).intersects_first(origins, rays[1:])
+print(json.dumps(first.tolist()))
+"""
+
+
+def test_first_hits_of_sponza_agree_with_embree(tmp_path):
+    pytest.importorskip("embreex")
+    path = scene_file("sponza_dabrovic.ply")
+    triangles = np.asarray(trimesh.load(path, process=False).triangles, dtype=np.float64)
+    camera = Camera((-6.5, 4.2, 1.6), (3, 2.2, -3.2), vfov=62, resolution=(320, 240))
+    counters: dict[str, int] = {}
+    buffer = find_visible(ListBlockers(triangles, chunk=9000), camera, full(camera), counters=counters)
+    frame = camera.frame()
+    y, x = np.divmod(np.arange(320 * 240), 320)
+    rays = frame.d0 + y[:, None] * frame.dy + x[:, None] * frame.dx
+    np.save(tmp_path / "rays.npy", np.concatenate([frame.eye[None], rays]))
+    run = subprocess.run(
+        [sys.executable, "-c", _EMBREE, str(path), str(tmp_path / "rays.npy")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    ours, theirs = own_picture(buffer, camera).ravel(), np.array(json.loads(run.stdout))
+    different = np.flatnonzero(ours != theirs)
+    assert len(different) < 0.002 * len(ours)
+    # Where they differ, the rationals say that what we see is hit, and no later than what Embree saw.
+    eye = exact(frame.eye)
+    for pixel in different:
+        ray = ray_of(frame, int(x[pixel]), int(y[pixel]))
+        candidates = [int(i) for i in (ours[pixel], theirs[pixel]) if i >= 0]
+        hits = [(hit_parameter([exact(v) for v in triangles[i]], eye, ray), i) for i in candidates]
+        assert min(((t, i) for t, i in hits if t is not None), default=(None, -1))[1] == ours[pixel]
+    assert_receivers(buffer, ListBlockers(triangles), camera, stride=97)
