@@ -22,9 +22,25 @@ HEADER = ("scene", "triangles", "receivers", *(f"{s} s" for s in STAGES), "peak 
 def run(scene: Path, out: Path, arguments: argparse.Namespace) -> dict[str, float]:
     """Render one scene in a child process; its numbers."""
     stats = out / f"{scene.stem}.json"
-    command = [sys.executable, "-m", "penumbra", "-q", "render", str(scene), "-o", str(out / f"{scene.stem}.exr")]
+    command = [
+        sys.executable,
+        "-m",
+        "penumbra",
+        "-q",
+        "render",
+        str(scene),
+        "-o",
+        str(out / f"{scene.stem}.exr"),
+    ]
     command += ["--resolution", arguments.size, "--samples", str(arguments.samples), "--overwrite"]
-    command += ["--threads", str(arguments.threads), "--preview", str(out / f"{scene.stem}.png"), "--stats", str(stats)]
+    command += [
+        "--threads",
+        str(arguments.threads),
+        "--preview",
+        str(out / f"{scene.stem}.png"),
+        "--stats",
+        str(stats),
+    ]
     subprocess.run(command, check=True)
     numbers: dict[str, float] = json.loads(stats.read_text())
     return numbers
@@ -40,7 +56,9 @@ def row(name: str, n: dict[str, float]) -> list[str]:
 
 def main() -> None:
     """Render the scenes and print the table as Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=", ".join(SCENES))
     parser.add_argument("--out", type=Path, help="folder of pictures and numbers (default: a temporary one)")
     parser.add_argument("--size", default="1280x960")

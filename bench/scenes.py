@@ -25,7 +25,9 @@ SCENES = {
 }  # fmt: skip
 
 
-def write_scene(name: str, folder: Path, meshes: Path = FOLDER, samples: int = 256, sets: int = 8) -> Path | None:
+def write_scene(
+    name: str, folder: Path, meshes: Path = FOLDER, samples: int = 256, sets: int = 8
+) -> Path | None:
     """Write a scene file (and a floor where the scene wants one); None if the mesh is not there."""
     mesh, up, floor, eye, look_at, vfov, corner, edge_u, edge_v = SCENES[name]
     if not (meshes / mesh).exists():
@@ -33,11 +35,19 @@ def write_scene(name: str, folder: Path, meshes: Path = FOLDER, samples: int = 2
     lines = ["[[geometry]]", f'path = "{meshes / mesh}"', f'up = "{up}"']
     if floor:
         height, half = floor
-        corners = np.array([[-half, height, half], [half, height, half], [half, height, -half], [-half, height, -half]])
+        corners = np.array(
+            [[-half, height, half], [half, height, half], [half, height, -half], [-half, height, -half]]
+        )
         text = "".join("v {:.9g} {:.9g} {:.9g}\n".format(*c) for c in corners)
         (folder / f"{name}-floor.obj").write_text(text + "f 1 2 3 4\n")
         lines += ["[[geometry]]", f'path = "{name}-floor.obj"']
-    lines += ["[camera]", f"eye = {eye}", f"look_at = {look_at}", f"vfov = {vfov}", "resolution = [1280, 960]"]
+    lines += [
+        "[camera]",
+        f"eye = {eye}",
+        f"look_at = {look_at}",
+        f"vfov = {vfov}",
+        "resolution = [1280, 960]",
+    ]
     lines += ["[[light]]", 'name = "key"', 'type = "rect"', f"corner = {corner}", f"edge_u = {edge_u}"]
     lines += [f"edge_v = {edge_v}", f"samples = {samples}", f"sets = {sets}", "radiance = 10.0"]
     path = folder / f"{name}.toml"

@@ -34,7 +34,9 @@ COUNTERS = ("nodes_visited", "plane_box_tests", "plane_point_tests", "group_volu
             "samples_tested", "masks_allocated")  # fmt: skip
 
 
-def measure(scene: penumbra.Scene, stores: dict[bool, Blockers], seen: tuple, options: CastOptions, threads: int):  # type: ignore[no-untyped-def]
+def measure(
+    scene: penumbra.Scene, stores: dict[bool, Blockers], seen: tuple, options: CastOptions, threads: int
+):  # type: ignore[no-untyped-def]
     """Cast what the camera sees; the result and processor seconds."""
     points, normals, own, pixel = seen
     began = time.process_time()
@@ -51,12 +53,20 @@ def row(name: str, result: CastResult, seconds: float, base: CastResult, base_se
         raise SystemExit(f"{name}: masks differ")
     counters = result.stats.counters
     million = [f"{counters[key] / 1e6:.2f}" for key in COUNTERS]
-    return [name, f"{seconds:.1f}", f"{seconds / base_seconds:.2f}", *million, f"{counters['mask_bytes'] / 2**20:.1f}"]
+    return [
+        name,
+        f"{seconds:.1f}",
+        f"{seconds / base_seconds:.2f}",
+        *million,
+        f"{counters['mask_bytes'] / 2**20:.1f}",
+    ]
 
 
 def main() -> None:
     """Print one table per scene as Markdown."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=", ".join(SCENES))
     parser.add_argument("--size", default="320x240")
     parser.add_argument("--samples", type=int, default=256)
@@ -70,7 +80,9 @@ def main() -> None:
                 print(f"{name}: its mesh is not on this machine")
                 continue
             scene = penumbra.Scene.load(path).with_overrides(resolution=(width, height))
-            stores = {sort: blockers_in_memory(scene.geometry, IngestOptions(sort=sort)) for sort in (True, False)}
+            stores = {
+                sort: blockers_in_memory(scene.geometry, IngestOptions(sort=sort)) for sort in (True, False)
+            }
             seen = penumbra.camera_receivers(scene)
             measure(scene, stores, tuple(a[:100] for a in seen), CastOptions(), 1)
             base, base_seconds = measure(scene, stores, seen, CastOptions(), arguments.threads)
@@ -80,7 +92,9 @@ def main() -> None:
             for label, off in SWITCHES.items():
                 options = replace(CastOptions(), **off)  # type: ignore[arg-type]
                 result, seconds = (
-                    (base, base_seconds) if not off else measure(scene, stores, seen, options, arguments.threads)
+                    (base, base_seconds)
+                    if not off
+                    else measure(scene, stores, seen, options, arguments.threads)
                 )
                 print("| " + " | ".join(row(label, result, seconds, base, base_seconds)) + " |", flush=True)
 

@@ -115,7 +115,8 @@ def backend_named(name: str) -> Any:
 def visible_fraction(masks: UInt64Array, n_samples: int) -> Float32Array:
     """Fraction (R,) float32 of n_samples that are not blocked in masks (R, n_words)."""
     blocked = np.bitwise_count(masks).sum(axis=1, dtype=np.int64)
-    return ((n_samples - blocked) / n_samples).astype(np.float32)
+    visibility: Float32Array = ((n_samples - blocked) / n_samples).astype(np.float32)
+    return visibility
 
 
 def _cast_in_passes(
@@ -137,7 +138,8 @@ def _cast_in_passes(
     stats = Stats("hpc" if backend == "auto" else backend)
     for first in range(0, n_receivers, per_pass):
         rows = slice(first, first + per_pass)
-        part = Receivers(*(a[rows] if len(a) else a for a in receivers))
+        normals = receivers.normals[rows] if len(receivers.normals) else receivers.normals
+        part = Receivers(receivers.points[rows], normals, receivers.own[rows], receivers.index[rows])
         found, sample_set[rows], part_stats = cast_receivers(part, blockers, light, **how)
         visibility[rows] = visible_fraction(found, light.samples)
         if masks is not None:
@@ -189,7 +191,10 @@ def _checked_receivers(points: Any, normals: Any, own: Any, index: Any) -> Recei
     own = np.full(n_receivers, -1) if own is None else own
     index = np.arange(n_receivers) if index is None else index
     return Receivers(
-        points, normals, _checked_integers(own, "own", n_receivers), _checked_integers(index, "index", n_receivers)
+        points,
+        normals,
+        _checked_integers(own, "own", n_receivers),
+        _checked_integers(index, "index", n_receivers),
     )
 
 

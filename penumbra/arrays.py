@@ -92,7 +92,7 @@ class ReceiverBvh(NamedTuple):
 
     boxes: Float64Array  # (N, 6) min and max of the receivers below a node
     first: Int32Array  # (N,) first slot below a node
-    count: Int32Array  # (N,) slots below a node
+    n_slots: Int32Array  # (N,) slots below a node
     child: Int32Array  # (N,) left child, the right one follows; -1: a leaf
     umbra: UInt64Array  # (N, ceil(G / 64)) group-umbra bits: group blocked for all receivers below
     points: Float64Array  # (n, 3) receiver points by slot
@@ -123,7 +123,7 @@ class CastScratch(NamedTuple):
     group_volumes: Float64Array  # (G, 4, 8)
     group_found: Int64Array  # (G,) which of the eight planes a group's volume has
     choices: Int64Array  # (2, 7) corners the planes went through: of the light, of the group in hand
-    blocker: Float64Array  # (6,) normal of the blocker and its componentwise permanent
+    normal: Float64Array  # (6,) normal of the blocker and its componentwise permanent
     edges: Float32Array  # (4, 4) edge functions over the light: A, B, C, bound
 
 
@@ -134,6 +134,16 @@ class Shaft(NamedTuple):
     planes: Float64Array  # (12, 4) n . p <= d inside
     extent: float  # largest coordinate of tile and light
     reach: float  # longest segment
+
+
+class Blocker(NamedTuple):
+    """The blocker in hand, as casting passes it down."""
+
+    corners: Float64Array  # (3, 3)
+    id: int
+    side: int  # side of its plane on which the whole light lies for certain, or 0
+    extent: float  # largest coordinate of blocker, tile and light
+    amplify: float  # reach of a shadow over the gap to the light; inf: they may touch
 
 
 class CastSwitches(NamedTuple):

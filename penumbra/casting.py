@@ -4,7 +4,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from penumbra.arrays import BlockerChunk, CastScratch, CastSwitches, LightSamples, Receivers, UInt8Array, UInt64Array
+from penumbra.arrays import (
+    BlockerChunk,
+    CastScratch,
+    CastSwitches,
+    LightSamples,
+    Receivers,
+    UInt8Array,
+    UInt64Array,
+)
 from penumbra.blockers import Blockers, prefetch
 from penumbra.executors.threads import run_tasks
 from penumbra.facing import face_light, full_mask, words_of
@@ -63,7 +71,7 @@ def _make_tiles(
     threads: int,
 ) -> list[ReceiverTile]:
     """Tiles of the receivers that face the light, with their hierarchies built."""
-    partial = masks.any(axis=1)
+    partial = np.asarray(masks.any(axis=1))
 
     def make(rows: np.ndarray) -> ReceiverTile:
         tile = ReceiverTile(
@@ -113,7 +121,11 @@ def _cast_chunks(
     progress.stage("cast", blockers.n_triangles, "triangles")
     for number, chunk in prefetch(blockers, wanted()):
         work = [k for k, tile in enumerate(tiles) if touches[k, number] and tile.n_live]
-        run_tasks(lambda k, chunk=chunk: _cast_tile(tiles[k], chunk, samples, options, counters[k]), work, threads)
+
+        def cast_tile(k: int, chunk: BlockerChunk = chunk) -> None:
+            _cast_tile(tiles[k], chunk, samples, options, counters[k])
+
+        run_tasks(cast_tile, work, threads)
         progress.advance(len(chunk.ids))
     return counters
 
@@ -163,7 +175,7 @@ def _scratch(depth: int, n_groups: int) -> CastScratch:
         group_volumes=np.zeros((n_groups, 4, 8)),
         group_found=np.zeros(n_groups, np.int64),
         choices=np.zeros((2, 7), np.int64),
-        blocker=np.zeros(6),
+        normal=np.zeros(6),
         edges=np.zeros((4, 4), np.float32),
     )
 

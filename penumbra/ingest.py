@@ -147,8 +147,7 @@ def _distribute(stream: SourceStream, files: Scratch, sort: bool) -> tuple[dict[
     n_dropped = 0
     for vertices, ids in stream.batches():
         narrow = _as_float32(vertices)
-        exact: Float64Array = np.ascontiguousarray(vertices, np.float64)
-        areas, centres = measure(exact)
+        areas, centres = measure(vertices.astype(np.float64, order="C", copy=False))
         n_dropped += int((areas < 0).sum())
         for number, rows in split_by_bin(areas, centres, sort, histogram):
             files.append(number, np.take(narrow, rows, axis=0), ids[rows])

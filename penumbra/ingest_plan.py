@@ -54,7 +54,8 @@ class MemoryPlan(NamedTuple):
 def plan_memory(before_bytes: int, limit_bytes: int, chunk_triangles: int) -> MemoryPlan:
     """Share out `limit_bytes` above `before_bytes`, the resident memory when ingest began.
 
-    What libraries and kernels took since is in it. Raises MemoryLimitError, with the figure that would do, when it is too little.
+    What libraries and kernels took since is in it. Raises MemoryLimitError, with the figure that would
+    do, when it is too little.
     """
     chunk_bytes = chunk_triangles * _CHUNK_TRIANGLE_BYTES
     taken_bytes = max(0, resident_bytes() - before_bytes)
@@ -103,7 +104,7 @@ def estimate_triangles(meshes: Iterable[MeshRef]) -> tuple[int, bool]:
 
 def store_bytes(n_triangles: int, coordinates: np.dtype[Any]) -> int:
     """Size of a store: vertices, ids, and a box for every 16 triangles and fewer above."""
-    return n_triangles * (9 * coordinates.itemsize + 8 + 6 * coordinates.itemsize // 15)
+    return n_triangles * (9 * coordinates.itemsize + 8) + n_triangles * 6 * coordinates.itemsize // 15
 
 
 def check_disk(

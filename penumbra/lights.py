@@ -1,32 +1,27 @@
 """5: lights, their stratified samples, and the light sample hierarchy that casting works on."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from penumbra.arrays import Float64Array, Int64Array, LightSamples, UInt8Array
 from penumbra.errors import SceneError
 
 MAX_SETS = 256
 MAX_SAMPLES = 1 << 16
+MAX_SEED = 2**63 - 1
 _U64 = np.uint64
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class RectLight:
-    """A rectangular (or skewed: any parallelogram) area light that emits along cross(edge_u, edge_v).
+    """A rectangular (or skewed: any parallelogram) area light that emits along cross(edge_u, edge_v)."""
 
-    corner, edge_u, edge_v: three numbers each, world space. `samples` (K) points per set, one in each
-    of K strata of equal area; `sets` distinct sample sets against banding (HPC section 3.4); `radiance`
-    in W m^-2 sr^-1. Raises SceneError for numbers that are not finite or out of range.
-    """
-
-    corner: Sequence[float] | Float64Array
-    edge_u: Sequence[float] | Float64Array
-    edge_v: Sequence[float] | Float64Array
+    corner: Float64Array
+    edge_u: Float64Array
+    edge_v: Float64Array
     samples: int = 256
     sets: int = 8
     seed: int = 0
@@ -34,18 +29,39 @@ class RectLight:
     radiance: float = 1.0
     name: str = "light"
 
-    def __post_init__(self) -> None:
-        for field in ("corner", "edge_u", "edge_v"):
-            object.__setattr__(self, field, _vector(getattr(self, field), f"{field} of light '{self.name}'"))
-        for field, low, high in (("samples", 1, MAX_SAMPLES), ("sets", 1, MAX_SETS), ("seed", 0, 2**63 - 1)):
-            value = getattr(self, field)
-            if isinstance(value, bool) or int(value) != value or not low <= value <= high:
-                raise SceneError(
-                    f"{field} of light '{self.name}' is {value!r}: give a whole number from {low} to {high}"
-                )
-            object.__setattr__(self, field, int(value))
-        if not (np.isfinite(self.radiance) and self.radiance >= 0):
-            raise SceneError(f"radiance of light '{self.name}' is {self.radiance!r}: give a number >= 0")
+    def __init__(
+        self,
+        corner: ArrayLike,
+        edge_u: ArrayLike,
+        edge_v: ArrayLike,
+        samples: int = 256,
+        sets: int = 8,
+        seed: int = 0,
+        two_sided: bool = False,
+        radiance: float = 1.0,
+        name: str = "light",
+    ) -> None:
+        """Check and keep the numbers.
+
+        corner, edge_u, edge_v: three numbers each, world space. `samples` (K) points per set, one in
+        each of K strata of equal area; `sets` distinct sample sets against banding (HPC section 3.4);
+        `radiance` in W m^-2 sr^-1. Raises SceneError for numbers that are not finite or out of range.
+        """
+        keep = partial(object.__setattr__, self)
+        keep("name", str(name))
+        for field, vector in (("corner", corner), ("edge_u", edge_u), ("edge_v", edge_v)):
+            keep(field, _vector(vector, f"{field} of light '{name}'"))
+        whole = (
+            ("samples", samples, 1, MAX_SAMPLES),
+            ("sets", sets, 1, MAX_SETS),
+            ("seed", seed, 0, 2**63 - 1),
+        )
+        for field, value, low, high in whole:
+            keep(field, _whole_number(value, f"{field} of light '{name}'", low, high))
+        if not (isinstance(radiance, int | float | np.number) and np.isfinite(radiance) and radiance >= 0):
+            raise SceneError(f"radiance of light '{name}' is {radiance!r}: give a number >= 0")
+        keep("radiance", float(radiance))
+        keep("two_sided", bool(two_sided))
 
     @cached_property
     def area(self) -> float:
@@ -62,7 +78,8 @@ class RectLight:
     def sample_points(self) -> Float64Array:
         """Light samples, float64 (sets, K, 3), world space; consecutive samples are neighbours."""
         s, t = np.moveaxis(self._parameters, -1, 0)
-        return self.corner + s[..., None] * self.edge_u + t[..., None] * self.edge_v
+        points: Float64Array = self.corner + s[..., None] * self.edge_u + t[..., None] * self.edge_v
+        return points
 
     @cached_property
     def _parameters(self) -> Float64Array:
@@ -88,7 +105,9 @@ class RectLight:
             edge_v=np.array(self.edge_v),
             parameters=lanes,
             points=np.ascontiguousarray(self.sample_points[:, padded]),
-            corners=np.concatenate([self._corners(low.min(0)[None], high.max(0)[None]), self._corners(low, high)]),
+            corners=np.concatenate(
+                [self._corners(low.min(0)[None], high.max(0)[None]), self._corners(low, high)]
+            ),
             full_groups=_full_groups(self.samples, group_size),
             # Six roundings at most make a sample point, and as many the origin it is compared with.
             residual=16.0 * 2.0**-53 * float(reach),
@@ -98,7 +117,8 @@ class RectLight:
         """Corners (n, 4, 3), in order around the rectangle, of (n, 2) parameter bounds about the centre."""
         s = np.stack([low[:, 0], high[:, 0], high[:, 0], low[:, 0]], axis=1) + 0.5
         t = np.stack([low[:, 1], low[:, 1], high[:, 1], high[:, 1]], axis=1) + 0.5
-        return np.asarray(self.corner) + s[..., None] * self.edge_u + t[..., None] * self.edge_v
+        corners: Float64Array = self.corner + s[..., None] * self.edge_u + t[..., None] * self.edge_v
+        return corners
 
 
 def sample_sets_of(index: Int64Array, seed: int, sets: int) -> UInt8Array:
@@ -111,7 +131,7 @@ def sample_sets_of(index: Int64Array, seed: int, sets: int) -> UInt8Array:
     return ((key >> _U64(32)) * _U64(sets) >> _U64(32)).astype(np.uint8)
 
 
-def _vector(value: Sequence[float] | Float64Array, what: str) -> Float64Array:
+def _vector(value: ArrayLike, what: str) -> Float64Array:
     try:
         vector = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -122,7 +142,15 @@ def _vector(value: Sequence[float] | Float64Array, what: str) -> Float64Array:
     return vector
 
 
-def _length(edge: Sequence[float] | Float64Array) -> float:
+def _whole_number(value: object, what: str, low: int, high: int) -> int:
+    is_number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    number = int(value) if is_number and np.isfinite(value) else low - 1  # type: ignore[call-overload]
+    if number != value or not low <= number <= high:
+        raise SceneError(f"{what} is {value!r}: give a whole number from {low} to {high}")
+    return number
+
+
+def _length(edge: Float64Array) -> float:
     return float(np.linalg.norm(edge))
 
 

@@ -96,4 +96,5 @@ def _surface_area_order(vertices: Float64Array) -> Int64Array:
     fill_unit_boxes(vertices, bounds_of(boxes_4096), boxes)
     fill_axis_orders(boxes, orders)
     sort_by_surface_area(boxes, orders)
-    return orders[0].astype(np.int64)
+    order: Int64Array = orders[0].astype(np.int64)
+    return order

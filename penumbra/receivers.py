@@ -14,7 +14,7 @@ from penumbra.arrays import (
     UInt8Array,
     UInt64Array,
 )
-from penumbra.kernels.casting import MASK_NONE, MASK_UMBRA, fill_umbra
+from penumbra.kernels.masks import MASK_NONE, MASK_UMBRA, fill_umbra
 from penumbra.kernels.receiver_bvh import build_bvh
 from penumbra.kernels.shaft import N_SHAFT_PLANES, fill_shaft, runs_touch_shaft
 
@@ -79,7 +79,7 @@ class ReceiverTile:
         self.bvh = ReceiverBvh(
             boxes=boxes,
             first=first,
-            count=count,
+            n_slots=count,
             child=child,
             umbra=np.zeros((len(boxes), -(-n_groups // 64)), np.uint64),
             points=self._points[order],
@@ -165,7 +165,13 @@ def _build(
     boxes = np.empty((room, 6))
     first, count, child = (np.empty(room, np.int32) for _ in range(3))
     n_nodes, depth = build_bvh(points, order, leaf_size, boxes, first, count, child)
-    return boxes[:n_nodes].copy(), first[:n_nodes].copy(), count[:n_nodes].copy(), child[:n_nodes].copy(), int(depth)
+    return (
+        boxes[:n_nodes].copy(),
+        first[:n_nodes].copy(),
+        count[:n_nodes].copy(),
+        child[:n_nodes].copy(),
+        int(depth),
+    )
 
 
 def _shaft(points: Float64Array, light: LightSamples) -> Shaft:

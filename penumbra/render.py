@@ -1,13 +1,14 @@
 """The story of a render, from scene file to OpenEXR image; the calls stand in the order of the stages."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from penumbra.api import backend_named
 from penumbra.arrays import Receivers
 from penumbra.blockers import Blockers
+from penumbra.compile_ahead import compile_ahead
 from penumbra.errors import SceneError
 from penumbra.executors.threads import resolve_threads
 from penumbra.film import LIGHT_LAYERS, Film, Window
@@ -101,6 +102,8 @@ def render(
     cast_receivers = backend_named(backend)
     plan = _make_plan(scene, window, memory, process_limit, threads)
     run = Stats(backend)
+    with run.timed("compile"):
+        compile_ahead(progress)
     film = Film(*plan.resolution, window, [light.name for light in scene.lights])
     with _open_blockers(scene, plan, outputs.scratch_parent(scratch), run, progress) as blockers:
         for band in plan.passes:
@@ -175,11 +178,6 @@ def _effective_scene(
     for mesh in loaded.geometry:
         if not mesh.path.is_file():
             raise SceneError(f"{mesh.path}: no such file; check the path in {loaded.path or 'the scene'}")
-        if mesh.is_store and len(loaded.geometry) > 1:
-            raise SceneError(
-                f"{mesh.path} is a blocker store, which must be the only geometry: "
-                "ingest all meshes into one store"
-            )
     width, height = loaded.camera.resolution
     window = (0, 0, width, height) if crop is None else tuple(int(edge) for edge in crop)
     x0, y0, x1, y1 = window
@@ -216,18 +214,15 @@ def _make_plan(
 
 def _measure_geometry(scene: Scene) -> GeometryPlan:
     """Count triangles from the headers; where a format has none, take the most that the file can hold."""
-    if scene.geometry[0].is_store:
-        with closing(open_store(scene.geometry[0].path)) as store:
-            return GeometryPlan(store.n_triangles, is_exact=True, is_store=True)
     n_triangles, is_exact = 0, True
     for mesh in scene.geometry:
-        with open_mesh(mesh.path) as reader:
-            if reader.n_triangles is None:
+        with open_store(mesh.path) if mesh.is_store else open_mesh(mesh.path) as source:
+            if source.n_triangles is None:
                 is_exact = False
-                n_triangles += reader.size_bytes // _LEAST_TRIANGLE_BYTES
+                n_triangles += source.size_bytes // _LEAST_TRIANGLE_BYTES
             else:
-                n_triangles += reader.n_triangles
-    return GeometryPlan(n_triangles, is_exact, is_store=False)
+                n_triangles += source.n_triangles
+    return GeometryPlan(n_triangles, is_exact, len(scene.geometry) == 1 and scene.geometry[0].is_store)
 
 
 @contextmanager

@@ -6,10 +6,13 @@ excluded, ties to the lowest triangle index. All of it is decided exactly, so th
 order of blockers, no chunk, window or thread.
 """
 
+import math
+import mmap
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from penumbra.arrays import BlockerChunk, Float64Array, Int64Array
 from penumbra.blockers import Blockers, prefetch
@@ -29,6 +32,7 @@ from penumbra.progress import NullProgress, Progress
 from penumbra.scene import Camera, CameraFrame
 
 Window = tuple[int, int, int, int]
+Number = TypeVar("Number", bound=np.generic)
 
 BAND_ROWS = 64
 """Rows of a z-buffer band, the unit of a thread."""
@@ -59,7 +63,10 @@ class GBuffer(NamedTuple):
 
 
 def window_bytes(width: int, height: int, threads: int = 1) -> int:
-    """Most bytes that `find_visible` holds for a window of this size, its result included, chunks not."""
+    """Most bytes that `find_visible` holds for a window of this size, its result included.
+
+    Beside them stand the chunk in use, 112 bytes for each of its triangles, and the chunk read ahead.
+    """
     # The z-buffer is given back band by band while the receivers are written, one band a thread.
     rows = min(height, BAND_ROWS * resolve_threads(threads))
     return width * (height * _Z_PIXEL_BYTES + rows * _RECEIVER_BYTES)
@@ -167,17 +174,23 @@ def _empty_bands(window: Window) -> list[ZBand]:
     bands = []
     for top in range(y0, y1, BAND_ROWS):
         shape = min(BAND_ROWS, y1 - top), x1 - x0
-        bands.append(
-            ZBand(
-                near=np.full(shape, np.inf, dtype=np.float32),
-                far=np.full(shape, np.inf, dtype=np.float32),
-                own=np.full(shape, -1, dtype=np.int64),
-                vertices=np.empty((*shape, 9)),
-                left=x0,
-                top=top,
-            )
+        band = ZBand(
+            near=_own_pages(shape, np.float32),
+            far=_own_pages(shape, np.float32),
+            own=_own_pages(shape, np.int64),
+            vertices=_own_pages((*shape, 9), np.float64),
+            left=x0,
+            top=top,
         )
+        band.near[:], band.far[:], band.own[:] = np.inf, np.inf, -1
+        bands.append(band)
     return bands
+
+
+def _own_pages(shape: tuple[int, ...], dtype: type[Number]) -> NDArray[Number]:
+    """A zeroed array whose memory goes back to the system with it; malloc keeps blocks below 32 MiB."""
+    n_bytes = math.prod(shape) * np.dtype(dtype).itemsize
+    return np.frombuffer(mmap.mmap(-1, max(n_bytes, 1)), dtype, math.prod(shape)).reshape(shape)
 
 
 def _rasterise_chunk(

@@ -48,5 +48,5 @@ def _ply_body() -> bytes:
 
 def _scene(store: Path) -> Scene:
     light = RectLight([-0.4, 2.0, -0.4], [0.8, 0, 0], [0, 0, 0.8], samples=40, name="key")
-    camera = Camera([0, 2, 3], [0, 0, 0], resolution=(16, 12))
+    camera = Camera((0, 2, 3), (0, 0, 0), resolution=(16, 12))
     return Scene((MeshRef(store),), camera, (light,))

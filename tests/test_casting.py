@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from penumbra.api import cast
-from penumbra.arrays import Receivers
+from penumbra.arrays import Blocker, Receivers
 from penumbra.facing import full_mask
 from penumbra.kernels import lanes
 from penumbra.kernels.borrow import borrow
-from penumbra.kernels.hard_shadow import fill_blocker
+from penumbra.kernels.hard_shadow import fill_normal
 from penumbra.kernels.penumbra_volume import contains_point, fill_volume, light_gap
 from penumbra.kernels.receiver_bvh import build_bvh
 from penumbra.lights import RectLight, sample_sets_of
@@ -76,13 +76,14 @@ def test_tiles_partition_the_live_rows(rng):
 @numba.njit
 def _volume(tri, light, polygon, extent, reach, points, inside):
     planes = np.empty((4, 8))
-    blocker, choices = np.empty(6), np.full(7, -1)
-    fill_blocker(tri, blocker)
+    normal, choices = np.empty(6), np.full(7, -1)
+    fill_normal(tri, normal)
     gap = light_gap(tri, light)
     if gap <= 0.0:
         inside[:] = True
         return
-    found = fill_volume(tri, blocker, light, polygon, extent, reach / gap, choices, planes)
+    blocker = Blocker(tri, 0, 0, extent, reach / gap)
+    found = fill_volume(blocker, normal, light, polygon, choices, planes)
     for r in range(points.shape[0]):
         inside[r] = contains_point(planes, 0, found, points[r, 0], points[r, 1], points[r, 2])
 
@@ -166,7 +167,11 @@ def _wall_and_grass(rng):
     wall = np.array([[[-3, 1, -3], [0, 1, -3], [0, 1, 3]], [[-3, 1, -3], [0, 1, 3], [-3, 1, 3]]], float)
     grass = rng.uniform([-2, 0.2, -2], [2, 0.8, 2], (2000, 1, 3)) + rng.normal(size=(2000, 3, 3)) * 0.05
     points = np.column_stack([rng.uniform(-1.5, 1.5, 3000), np.zeros(3000), rng.uniform(-1.5, 1.5, 3000)])
-    return points, np.concatenate([grass, wall]), RectLight([-0.5, 4, -0.5], [1, 0, 0], [0, 0, 1], samples=256)
+    return (
+        points,
+        np.concatenate([grass, wall]),
+        RectLight([-0.5, 4, -0.5], [1, 0, 0], [0, 0, 1], samples=256),
+    )
 
 
 def test_each_switch_keeps_the_bits_and_shows_its_worth(rng):

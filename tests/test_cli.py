@@ -302,6 +302,16 @@ def test_signals_stop_a_render(number: int, code: int, word: str, penumbra: Penu
     assert {path.name for path in tmp_path.iterdir()} == before
 
 
+def test_demo_prints_what_was_written(penumbra: Penumbra, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "penumbra.demo.run_demo", lambda folder, progress: [folder / "a.exr", folder / "a.png"]
+    )
+    assert penumbra("demo").out.split() == ["demo/a.exr", "demo/a.png"]
+    assert penumbra("demo", "-o", "made").out.split() == ["made/a.exr", "made/a.png"]
+    assert penumbra("demo", "-o", "square.obj").code == 2
+
+
+@pytest.mark.slow
 def test_demo(penumbra: Penumbra) -> None:
     for _ in range(2):
         done = penumbra("demo", "-o", "made")

@@ -160,6 +160,7 @@ def test_every_layout_gives_the_same_mesh(
     path = ply.write(tmp_path_factory.mktemp("ply") / "mesh.PLY")
     with open_mesh(path) as reader:
         assert reader.exact_float32 == is_float32
+        assert reader.n_triangles in (None, len(expected))
     triangles, ids = read_all(path, max_triangles, block_bytes=block_bytes, memory_bytes=memory_bytes)
     assert same_bits(triangles, expected.astype(np.float32 if is_float32 else np.float64))
     assert ids.tolist() == list(range(len(expected)))
@@ -328,7 +329,7 @@ def test_what_is_wrong_is_said_with_its_line(tmp_path: Path, text: str, message:
         (face_element([[0, 1, 2], [0, 1]]), ", face 1 (counted from 0): a face has 2 indices, but"),
         (face_element([[0, 1, 2], [0, 1, 1.5]], "f"), ", face 1 (counted from 0): a vertex index is"),
         (face_element([[0, 1, 2], [0, 1, 2, np.nan]], "d"), ", face 1 (counted from 0): a vertex index"),
-        (Element("tristrips", 1, [Column("vertex_indices", "i", "i", [[0, 1, 2, 5]])]), "uses vertex 5, but"),
+        (Element("tristrips", 1, [Column("vertex_indices", "i", "i", [[0, 1, 2, 5]])]), ", strip 0 (counted"),
         (Element("face", 1, [Column("vertex_indices", "i", "", [0])]), "'face' has no list 'vertex_indices'"),
     ],
 )  # fmt: skip
@@ -338,6 +339,20 @@ def test_what_is_wrong_in_a_binary_file(tmp_path: Path, kind: str, element: Elem
     with pytest.raises(MeshError) as caught:
         read_all(path)
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", FORMATS[1:])
+def test_vertices_that_are_not_numbers(tmp_path: Path, kind: str) -> None:
+    ply = Ply(kind, [vertex_element(CORNERS, "fdf"), face_element([[0, 1, 2], [1, 2, 3]])])
+    whole = ply.header() + b"".join(ply.rows())
+    z_of_first = len(ply.header()) + 4 + 8
+    path = tmp_path / "nan.ply"
+    for bits in (0x7F800001, 0x7FC00000, 0xFF800000):  # a signalling NaN, a quiet one, minus infinity
+        path.write_bytes(whole[:z_of_first] + struct.pack(ply.order + "I", bits) + whole[z_of_first + 4 :])
+        with pytest.raises(MeshError, match=r"face 0 \(counted from 0\): a face uses vertex 0, which"):
+            read_all(path)
+        triangles, ids = read_all(path, skip_bad=True)
+        assert ids.tolist() == [1] and np.isfinite(triangles).all()
 
 
 @pytest.mark.parametrize("kind", FORMATS[1:])
@@ -352,6 +367,23 @@ def test_lists_of_impossible_length(tmp_path: Path, kind: str) -> None:
         path.write_bytes(whole[:-16] + struct.pack(ply.order + "i", length) + whole[-12:])
         with pytest.raises(MeshError, match=message):
             read_all(path)
+
+
+def test_the_size_of_a_file_of_triangles_tells_their_number(tmp_path: Path) -> None:
+    triangles, edges = face_element([[0, 1, 2], [2, 1, 3]]), Element("edge", 1, [Column("a", "i", "", [0])])
+    with_quads = face_element([[0, 1, 2], [2, 1, 3, 0]])
+    quality = face_element([[0, 1, 2], [2, 1, 3]], "H", "I", (Column("quality", "d", "", [1, 2]),))
+    two_lists = face_element([[0, 1, 2], [2, 1, 3]], extra=(Column("uv", "f", "B", [[], []]),))
+    for kind, faces, n_triangles in [
+        *[(kind, faces, 2) for kind in FORMATS[1:] for faces in (triangles, quality)],
+        *[(FORMATS[1], faces, None) for faces in (with_quads, two_lists)],
+        ("ascii", triangles, None),
+    ]:
+        path = Ply(kind, [vertex_element(CORNERS), faces, edges]).write(tmp_path / "a.ply")
+        with open_mesh(path) as reader:
+            assert reader.n_triangles == n_triangles
+        with open_mesh(path, skip_bad=True) as reader:
+            assert reader.n_triangles is None
 
 
 def test_what_follows_the_values_of_an_ascii_line_is_ignored(tmp_path: Path) -> None:

@@ -310,15 +310,18 @@ def test_an_input_is_never_an_output(scene_path, tmp_path):
         assert output.read_bytes() == content
 
 
-def test_missing_geometry_and_mixed_stores(scene_path):
-    folder = scene_path.parent
-    (folder / "things.ply").rename(folder / "gone.ply")
+def test_missing_geometry(scene_path):
+    (scene_path.parent / "things.ply").unlink()
     with pytest.raises(SceneError, match="things.ply"):
         penumbra.render(scene_path)
-    penumbra.ingest([folder / "floor.obj"], folder / "things.h5").close()
+
+
+def test_stores_and_meshes_together(scene_path):
+    meshes = penumbra.render(scene_path).layers
+    folder = scene_path.parent
+    penumbra.ingest([folder / "things.ply"], folder / "things.h5").close()
     scene_path.write_text(SCENE.replace("things.ply", "things.h5"))
-    with pytest.raises(SceneError, match="only geometry"):
-        penumbra.render(scene_path)
+    assert_same_layers(penumbra.render(scene_path).layers, meshes)
 
 
 def test_failing_leaves_nothing_behind(scene_path, tmp_path, monkeypatch):

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from penumbra.arrays import BlockerChunk, ChunkInfo, Float64Array
 from penumbra.errors import BlockerStoreError
 from penumbra.io.buckets import bounds_of
+from penumbra.io.runs import disk_error
 
 FORMAT = "penumbra blocker store"
 SCHEMA_VERSION = 1
@@ -75,8 +76,10 @@ class StoreWriter:
         self._chunk_triangles = chunk_triangles
         self._boxes: list[Float64Array] = []
         self._n_chunks = [0] * len(buckets)
-        self._file = h5py.File(path, "w")
-        self._groups = [self._add_bucket(number, bucket) for number, bucket in enumerate(buckets)]
+        self._folder = path.parent
+        with self._write_errors():
+            self._file = h5py.File(path, "w")
+            self._groups = [self._add_bucket(number, bucket) for number, bucket in enumerate(buckets)]
 
     def _add_bucket(self, number: int, bucket: BucketRange) -> Any:
         group = self._file.create_group(f"buckets/{number:02d}")
@@ -98,14 +101,15 @@ class StoreWriter:
         number = self._n_chunks[bucket]
         self._n_chunks[bucket] += 1
         checksum = 0
-        for name, run, array in zip(_CHUNK_DATASETS, _RUNS, chunk, strict=True):
-            first = _n_rows(number * self._chunk_triangles, run, self._chunk_triangles)
-            data = np.ascontiguousarray(array, group[name].dtype)
-            group[name][first : first + len(data)] = data
-            checksum = zlib.crc32(data.data, checksum)
         box = bounds_of(list(chunk.boxes_4096))
-        group["chunk_boxes"][number] = box
-        group["chunk_checksums"][number] = checksum
+        with self._write_errors():
+            for name, run, array in zip(_CHUNK_DATASETS, _RUNS, chunk, strict=True):
+                first = _n_rows(number * self._chunk_triangles, run, self._chunk_triangles)
+                data = np.ascontiguousarray(array, group[name].dtype)
+                group[name][first : first + len(data)] = data
+                checksum = zlib.crc32(data.data, checksum)
+            group["chunk_boxes"][number] = box
+            group["chunk_checksums"][number] = checksum
         self._boxes.append(box)
 
     def finish(
@@ -117,6 +121,19 @@ class StoreWriter:
         created_by: str,
     ) -> None:
         """Write the facts about the whole store and close the file."""
+        with self._write_errors():
+            self._write_facts(counts, sources, histogram, is_sorted, created_by)
+            self._file.attrs["index_sha256"] = _index_sha256(self._file)
+            self._file.close()
+
+    def _write_facts(
+        self,
+        counts: StoreCounts,
+        sources: Sequence[Source],
+        histogram: dict[int, int],
+        is_sorted: bool,
+        created_by: str,
+    ) -> None:
         attributes = self._file.attrs
         attributes["format"] = FORMAT
         attributes["schema_version"] = SCHEMA_VERSION
@@ -135,8 +152,13 @@ class StoreWriter:
             for name, value in source._asdict().items():
                 if value is not None:
                     group.attrs[name] = value
-        attributes["index_sha256"] = _index_sha256(self._file)
-        self._file.close()
+
+    @contextlib.contextmanager
+    def _write_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, RuntimeError) as error:
+            raise disk_error(self._folder, error) from error
 
     def close(self) -> None:
         """Close the file, finished or not."""
@@ -279,7 +301,10 @@ def open_store(path: str | Path) -> BlockerStore:
 def _index_errors(path: Path) -> Iterator[None]:
     """Turn whatever a foreign or damaged file makes HDF5 raise into one sentence."""
     try:
-        if path.is_file() and not h5py.is_hdf5(path):
+        # h5py's own errors do not tell a folder from a foreign file.
+        with open(path, "rb"):
+            is_hdf5 = h5py.is_hdf5(path)
+        if not is_hdf5:
             raise BlockerStoreError(f"{path}: is not a blocker store (not an HDF5 file)")
         yield
     except BlockerStoreError:

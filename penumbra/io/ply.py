@@ -10,7 +10,7 @@ from penumbra.errors import MeshError
 from penumbra.io.faces import FacePage
 from penumbra.io.mesh_reader import MeshReader
 from penumbra.io.ply_binary import BinaryPly
-from penumbra.io.ply_header import Header, Truncated, least_bytes, read_header
+from penumbra.io.ply_header import Header, Truncated, least_bytes, read_header, triangles_by_size
 from penumbra.io.vertex_table import VertexTable
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ class PlyReader(MeshReader):
         self.exact_float32 = self._header.has_float32_vertices
         if not skip_bad:
             _check_size(path, self._header, size_bytes)
+            self.n_triangles = triangles_by_size(self._header, size_bytes)
         if self._header.byte_order:
             self._body: BinaryPly | TextPly = BinaryPly(path, self._header, size_bytes, block_bytes)
         else:
@@ -52,8 +53,10 @@ class PlyReader(MeshReader):
         # A header may promise anything; no file holds more vertices than it has bytes.
         at_most = min(element.count, self.size_bytes)
         table = VertexTable(dtype, at_most, self._memory_bytes, self._scratch)
-        for vertices in self._body.vertices():
-            table.append(vertices)
+        # Signalling NaNs, and ascii numbers that no float32 holds, only matter where a face uses them.
+        with np.errstate(invalid="ignore", over="ignore"):
+            for vertices in self._body.vertices():
+                table.append(vertices)
         return table
 
     def _face_pages(self) -> Iterator[FacePage]:

@@ -171,3 +171,23 @@ def least_bytes(element: Element, is_text: bool) -> int:
     if is_text:
         return 2 * element.count * len(element.properties)
     return element.count * sum((p.count_type or p.value_type).itemsize for p in element.properties)
+
+
+def triangles_by_size(header: Header, size_bytes: int) -> int | None:
+    """Number of triangles of a binary file, if its size tells that every face is one.
+
+    With n faces of at least three corners, the lists hold 3 n indices only if each face is a triangle.
+    """
+    rest_bytes = size_bytes - header.data_offset
+    n_triangles = 0
+    for element in header.elements:
+        n_lists = sum(p.count_type is not None for p in element.properties)
+        if n_lists > 1 or (n_lists and element.name != "face"):
+            return None
+        n_triangles += element.count * n_lists
+        for stored in element.properties:
+            list_bytes = (
+                stored.count_type.itemsize + 2 * stored.value_type.itemsize if stored.count_type else 0
+            )
+            rest_bytes -= element.count * (stored.value_type.itemsize + list_bytes)
+    return n_triangles if header.byte_order and rest_bytes == 0 else None

@@ -66,9 +66,7 @@ class TextPly:
         out = _Outputs(self._path)
         for state in self._scan(position, wanted, out):
             n_rows = int(state[ply_text.N_ROWS])
-            with np.errstate(over="ignore"):  # a number that no float32 can hold becomes infinite: unusable
-                vertices: NDArray[np.floating] = out.values[:n_rows].astype(dtype)
-            yield vertices
+            yield out.values[:n_rows].astype(dtype)
             # The vertex at hand, if one is unfinished.
             out.values[0] = out.values[min(n_rows, PAGE_FACES - 1)]
 
@@ -92,9 +90,8 @@ class TextPly:
         for state in self._scan(position, wanted, out):
             n_lists = int(state[ply_text.N_ROWS])
             begin = 0
-            for size, line in np.stack(
-                [out.faces.sizes[:n_lists], out.faces.lines[:n_lists]], axis=1
-            ).tolist():
+            sizes, lines = out.faces.sizes[:n_lists].tolist(), out.faces.lines[:n_lists].tolist()
+            for size, line in zip(sizes, lines, strict=True):
                 end = begin + size - n_taken
                 if page := stream.feed(out.faces.corners[begin:end], line):
                     yield page

@@ -131,15 +131,17 @@ def append_records(path: Path, records: Records) -> None:
         raise disk_error(path.parent, error) from error
 
 
-def disk_error(folder: Path, error: OSError) -> OutputError:
+def disk_error(folder: Path, error: OSError | RuntimeError) -> OutputError:
     """Say why a file in `folder` could not be written."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    number = getattr(error, "errno", None)
+    if number in (errno.ENOSPC, errno.EDQUOT):
         free_bytes = shutil.disk_usage(folder).free
         return OutputError(
             f"{folder}: the disk is full ({free_bytes} bytes left); "
             "make room, or name another folder for scratch files"
         )
-    return OutputError(f"{folder}: cannot write there ({error.strerror or error}); check the disk")
+    reason = os.strerror(number) if number else str(error)
+    return OutputError(f"{folder}: cannot write there ({reason}); check the disk")
 
 
 class SortPlan(NamedTuple):
@@ -214,8 +216,10 @@ def _read_files(files: list[BinFile]) -> Iterator[Records]:
     """Records of scratch files in slices; each file is removed when it has been read."""
     for file in files:
         for first in range(0, file.n_records, _SLICE_RECORDS):
-            yield _read_records(file, first, min(_SLICE_RECORDS, file.n_records - first))
-        file.path.unlink()
+            records = _read_records(file, first, min(_SLICE_RECORDS, file.n_records - first))
+            if first + len(records) == file.n_records:
+                file.path.unlink()
+            yield records
 
 
 def _read_records(file: BinFile, first: int, count: int) -> Records:

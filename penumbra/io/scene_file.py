@@ -2,13 +2,14 @@
 
 import math
 import re
+import reprlib
 import sys
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TypeVar, cast
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 
@@ -32,8 +33,6 @@ TABLE_KEYS = {
     ),
 }
 """Every table of a scene file and every key it may have."""
-
-LIGHT_TYPES = ("rect",)
 
 _HEADER = re.compile(r"\s*\[\[?\s*([\w.-]+)\s*\]\]?\s*(?:#.*)?$")
 _KEY = re.compile(r"\s*[\"']?([\w-]+)[\"']?\s*(?:\.|=)")
@@ -104,15 +103,21 @@ class _Table:
                     key,
                 )
 
-    def get(self, key: str, check: Callable[[Any], bool], wanted: str, default: Any = None) -> Any:
-        """The value of a key, or its default; None as default makes the key necessary."""
+    def needed(self, key: str, kind: "_Kind") -> Any:
+        """The value of a key that must be there."""
         if key not in self.values:
-            if default is None:
-                self.refuse(f"'{key}' is missing in {self.label}: it must be {wanted}")
-            return default
-        if not check(self.values[key]):
-            self.refuse(f"'{key}' in {self.label} is {self.values[key]!r}: it must be {wanted}", key)
-        return self.values[key]
+            self.refuse(f"'{key}' is missing in {self.label}: it must be {kind.wanted}")
+        return self._checked(key, kind)
+
+    def given(self, kinds: "Mapping[str, _Kind]") -> dict[str, Any]:
+        """The values of those keys that are there; for the others the scene has its own defaults."""
+        return {key: self._checked(key, kind) for key, kind in kinds.items() if key in self.values}
+
+    def _checked(self, key: str, kind: "_Kind") -> Any:
+        value = self.values[key]
+        if not kind.accepts(value):
+            self.refuse(f"'{key}' in {self.label} is {reprlib.repr(value)}: it must be {kind.wanted}", key)
+        return value
 
     def build(self, make: Callable[[], T]) -> T:
         """Make a part of the scene; what it refuses is told with the line of the key it speaks of."""
@@ -124,45 +129,27 @@ class _Table:
 
 
 def _geometry(table: _Table) -> MeshRef:
-    name = table.get("path", _is_text, "the name of a mesh file or blocker store")
-    path = table.path.parent / name
+    path = table.path.parent / table.needed("path", _FILE_NAME)
     if not path.is_file():
         table.refuse(f"'path' in {table.label}: there is no file {path}", "path")
-    up = cast(Literal["y", "z"], table.get("up", lambda v: v in ("y", "z"), '"y" or "z"', "y"))
-    numbers = table.get("transform", _are_numbers(16), "16 finite numbers, row by row", ())
-    transform = np.array(numbers, dtype=np.float64).reshape(4, 4) if numbers else None
-    return table.build(lambda: MeshRef(path, transform, up))
+    given = table.given({"up": _UP_AXIS, "transform": _MATRIX})
+    if "transform" in given:
+        given["transform"] = np.array(given["transform"], dtype=np.float64).reshape(4, 4)
+    return table.build(lambda: MeshRef(path, **given))
 
 
 def _camera(table: _Table) -> Camera:
-    three = "three finite numbers"
-    eye = table.get("eye", _are_numbers(3), three)
-    look_at = table.get("look_at", _are_numbers(3), three)
-    up = table.get("up", _are_numbers(3), three, Camera.up)
-    vfov = table.get("vfov", _is_number, "a number of degrees between 0 and 180", Camera.vfov)
-    resolution = table.get(
-        "resolution", _are_whole(2), "two whole numbers, width and height in pixels", Camera.resolution
-    )
-    return table.build(lambda: Camera(eye, look_at, up, vfov, resolution))
+    eye, look_at = (table.needed(key, _VECTOR) for key in ("eye", "look_at"))
+    given = table.given({"up": _VECTOR, "vfov": _DEGREES, "resolution": _PIXELS})
+    return table.build(lambda: Camera(eye, look_at, **given))
 
 
 def _light(table: _Table) -> RectLight:
-    three = "three finite numbers"
-    name = table.get("name", _is_text, "a text, unique and without a dot")
-    kinds = " or ".join(f'"{kind}"' for kind in LIGHT_TYPES)
-    table.get("type", lambda v: v in LIGHT_TYPES, kinds, LIGHT_TYPES[0])
-    corner, edge_u, edge_v = (
-        table.get(key, _are_numbers(3), three) for key in ("corner", "edge_u", "edge_v")
-    )
-    samples = table.get("samples", _is_whole, "a whole number above 0", RectLight.samples)
-    sets = table.get("sets", _is_whole, "a whole number above 0", RectLight.sets)
-    radiance = table.get("radiance", _is_number, "a finite number", RectLight.radiance)
-    two_sided = table.get("two_sided", lambda v: isinstance(v, bool), "true or false", RectLight.two_sided)
-    return table.build(
-        lambda: RectLight(
-            corner, edge_u, edge_v, samples, sets, two_sided=two_sided, radiance=float(radiance), name=name
-        )
-    )
+    name = table.needed("name", _LIGHT_NAME)
+    corner, edge_u, edge_v = (table.needed(key, _VECTOR) for key in ("corner", "edge_u", "edge_v"))
+    table.given({"type": _LIGHT_TYPE})
+    given = table.given({"samples": _COUNT, "sets": _COUNT, "radiance": _NUMBER, "two_sided": _SWITCH})
+    return table.build(lambda: RectLight(corner, edge_u, edge_v, name=name, **given))
 
 
 def _read_text(path: Path) -> str:
@@ -227,9 +214,25 @@ def _is_number(value: Any) -> bool:
     )
 
 
-def _are_numbers(count: int) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list) and len(value) == count and all(map(_is_number, value))
+def _list_of(count: int, accepts: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list) and len(value) == count and all(map(accepts, value))
 
 
-def _are_whole(count: int) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list) and len(value) == count and all(map(_is_whole, value))
+class _Kind(NamedTuple):
+    """What values a key takes, as a check and in words."""
+
+    accepts: Callable[[Any], bool]
+    wanted: str
+
+
+_FILE_NAME = _Kind(_is_text, "the name of a mesh file or blocker store")
+_UP_AXIS = _Kind(lambda value: value in ("y", "z"), '"y" or "z"')
+_MATRIX = _Kind(_list_of(16, _is_number), "16 finite numbers, row by row")
+_VECTOR = _Kind(_list_of(3, _is_number), "three finite numbers")
+_DEGREES = _Kind(_is_number, "a number of degrees between 0 and 180")
+_PIXELS = _Kind(_list_of(2, _is_whole), "two whole numbers, width and height in pixels")
+_LIGHT_NAME = _Kind(_is_text, "a text, unique and without a dot")
+_LIGHT_TYPE = _Kind(lambda value: value == "rect", '"rect"')
+_COUNT = _Kind(_is_whole, "a whole number above 0")
+_NUMBER = _Kind(_is_number, "a finite number")
+_SWITCH = _Kind(lambda value: isinstance(value, bool), "true or false")

@@ -5,6 +5,7 @@ Letters A to D are the optimizations of HPC section 3.3, each behind its switch.
 
 import numpy as np
 
+from penumbra.arrays import Blocker
 from penumbra.kernels._jit import helper, inlined, kernel
 from penumbra.kernels.bits import ONE, ZERO, lowest_bit, popcount64
 from penumbra.kernels.borrow import borrow
@@ -14,8 +15,6 @@ from penumbra.kernels.counters import (
     ESCALATED_F64,
     GROUP_VOLUMES_BUILT,
     LIGHT_VOLUMES_BUILT,
-    MASKS_ALLOCATED,
-    MASKS_RELEASED,
     NODES_VISITED,
     PAIRS_TESTED,
     PLANE_BOX_TESTS,
@@ -26,11 +25,21 @@ from penumbra.kernels.counters import (
     UMBRA_RECEIVERS_SKIPPED,
 )
 from penumbra.kernels.hard_shadow import (
-    fill_blocker,
     fill_edges,
+    fill_normal,
     light_side,
     receiver_side,
     test_samples,
+)
+from penumbra.kernels.masks import (
+    MASK_UMBRA,
+    group_bits,
+    is_full,
+    node_is_umbra,
+    release_mask,
+    take_mask,
+    update_inner_umbra,
+    update_leaf_umbra,
 )
 from penumbra.kernels.penumbra_volume import (
     ALL_PLANES,
@@ -43,62 +52,22 @@ from penumbra.kernels.penumbra_volume import (
 from penumbra.kernels.segment import segment_is_blocked
 from penumbra.kernels.shaft import box_outside_shaft, triangle_outside_shaft
 
-MASK_NONE = np.int32(-1)
-MASK_UMBRA = np.int32(-2)
 # What cast_blockers stopped for.
 DONE = np.int64(0)
 POOL_EMPTY = np.int64(1)
 REBUILD = np.int64(2)
-_WORD = np.int64(64)
 
 
 @inlined
-def _group_bits(pool, place, group, group_size):
-    """The group's bits of a mask, lowest bit first."""
-    if place < 0:
-        return ZERO
-    bit = group * group_size
-    return pool.masks[place, bit >> 6] >> np.uint64(bit & 63)
-
-
-@inlined
-def _is_full(pool, place):
-    for word in range(pool.full.shape[0]):
-        if pool.masks[place, word] != pool.full[word]:
-            return False
-    return True
-
-
-@inlined
-def _take_mask(pool, row, counters):
-    """D: a cleared mask for a receiver, or -1 if the pool is empty."""
-    if pool.state[0] == 0:
-        return np.int32(-1)
-    pool.state[0] -= 1
-    place = pool.free[pool.state[0]]
-    pool.masks[place, :] = ZERO
-    pool.place[row] = place
-    counters[MASKS_ALLOCATED] += 1
-    return place
-
-
-@inlined
-def _release_mask(pool, row, counters):
-    """D: give back the mask of a receiver in full umbra."""
-    pool.free[pool.state[0]] = pool.place[row]
-    pool.state[0] += 1
-    pool.place[row] = MASK_UMBRA
-    counters[MASKS_RELEASED] += 1
-
-
-@inlined
-def _block_group(tri, side, straddles, bvh, slot, light, group, n_samples, known, scratch, counters):
+def _block_group(blocker, side, bvh, slot, light, group, n_samples, known, scratch, counters):
     """Bits of one group that the blocker blocks for a receiver; `known` are blocked already."""
     full = light.full_groups[group]
     sample_set = np.int64(bvh.sample_set[slot])
     first = group * n_samples
     counters[SAMPLES_TESTED] += n_samples
-    blocked, possible = test_samples(scratch.edges, straddles, light.parameters, sample_set, first, n_samples)
+    blocked, possible = test_samples(
+        scratch.edges, blocker.side == 0, light.parameters, sample_set, first, n_samples
+    )
     left_open = possible & ~blocked & ~known & full
     if left_open != ZERO:
         counters[ESCALATED_F64] += popcount64(left_open)
@@ -107,61 +76,32 @@ def _block_group(tri, side, straddles, bvh, slot, light, group, n_samples, known
             lane = lowest_bit(left_open)
             left_open &= left_open - ONE
             point = light.points[sample_set, first + lane]
-            if segment_is_blocked(side, x, y, z, point[0], point[1], point[2], tri, counters):
+            if segment_is_blocked(side, x, y, z, point[0], point[1], point[2], blocker.corners, counters):
                 blocked |= ONE << np.uint64(lane)
     return blocked & full & ~known
 
 
 @helper
-def _build_group_volumes(tri, light, extent, amplify, scratch, counters):
+def _build_group_volumes(blocker, light, scratch, counters):
     """C: penumbra volumes of all groups (HPC figure 3, line 62)."""
     n_groups = light.full_groups.shape[0]
+    choices = scratch.choices[1]
     for group in range(n_groups):
-        scratch.choices[1, :] = scratch.choices[0]
+        choices[:] = scratch.choices[0]
         scratch.group_found[group] = fill_volume(
-            tri, scratch.blocker, light, 1 + group, extent, amplify, scratch.choices[1], scratch.group_volumes[group]
+            blocker, scratch.normal, light, 1 + group, choices, scratch.group_volumes[group]
         )
     counters[GROUP_VOLUMES_BUILT] += n_groups
 
 
 @inlined
-def _node_is_umbra(bvh, node, n_groups):
-    """A: whether all groups are blocked for all receivers below a node."""
-    for word in range(bvh.umbra.shape[1]):
-        n_bits = min(_WORD, n_groups - word * _WORD)
-        full = ~ZERO if n_bits == _WORD else (ONE << np.uint64(n_bits)) - ONE
-        if bvh.umbra[node, word] != full:
-            return False
-    return True
-
-
-@helper
-def _update_leaf_umbra(bvh, node, pool, light, group_size):
-    """A: group-umbra bits of a leaf, the AND over its receivers (HPC figure 3, lines 77 to 80)."""
-    n_groups = light.full_groups.shape[0]
-    for word in range(bvh.umbra.shape[1]):
-        bvh.umbra[node, word] = ZERO
-    for group in range(n_groups):
-        full = light.full_groups[group]
-        all_blocked = True
-        for slot in range(bvh.first[node], bvh.first[node] + bvh.count[node]):
-            place = pool.place[bvh.row[slot]]
-            if place != MASK_UMBRA and (_group_bits(pool, place, group, group_size) & full) != full:
-                all_blocked = False
-                break
-        if all_blocked:
-            bvh.umbra[node, group >> 6] |= ONE << np.uint64(group & 63)
-
-
-@inlined
-def _cast_on_receiver(tri, tri_side, slot, level, bvh, pool, light, group_size, switches, scratch, counters):
+def _cast_on_receiver(blocker, slot, level, bvh, pool, light, group_size, switches, scratch, counters):
     """Test a receiver inside V_L against the active groups; -1: pool empty, 1: a group became full."""
     row = bvh.row[slot]
     place = pool.place[row]
     x, y, z = bvh.points[slot, 0], bvh.points[slot, 1], bvh.points[slot, 2]
     side = np.int64(0)
     group_filled = np.int64(0)
-    straddles = tri_side == 0
     light_norm = (
         abs(light.edge_u[0]) + abs(light.edge_u[1]) + abs(light.edge_u[2])
         + abs(light.edge_v[0]) + abs(light.edge_v[1]) + abs(light.edge_v[2])
@@ -169,7 +109,7 @@ def _cast_on_receiver(tri, tri_side, slot, level, bvh, pool, light, group_size, 
     for k in range(scratch.n_active[level]):
         group = np.int64(scratch.active_group[level, k])
         full = light.full_groups[group]
-        known = _group_bits(pool, place, group, group_size) & full
+        known = group_bits(pool, place, group, group_size) & full
         if known == full and switches.umbra_bits:
             counters[UMBRA_GROUPS_SKIPPED] += 1
             continue
@@ -178,26 +118,26 @@ def _cast_on_receiver(tri, tri_side, slot, level, bvh, pool, light, group_size, 
         if active != 0 and not contains_point(scratch.group_volumes, group * VOLUME_SIZE, active, x, y, z):
             continue
         if side == 0:
-            side = receiver_side(tri, scratch.blocker, x, y, z, counters)
-            if side == 0 or side == tri_side:
+            side = receiver_side(blocker.corners, scratch.normal, x, y, z, counters)
+            if side == 0 or side == blocker.side:
                 return group_filled
             counters[PAIRS_TESTED] += 1
-            fill_edges(tri, scratch.blocker, side, x, y, z, light, light_norm, straddles, scratch.edges)
-        new = _block_group(tri, side, straddles, bvh, slot, light, group, group_size, known, scratch, counters)
+            fill_edges(blocker, scratch.normal, side, x, y, z, light, light_norm, scratch.edges)
+        new = _block_group(blocker, side, bvh, slot, light, group, group_size, known, scratch, counters)
         if new == ZERO:
             continue
         if place < 0:
-            place = _take_mask(pool, row, counters)
+            place = take_mask(pool, row, counters)
             if place < 0:
                 return np.int64(-1)
         bit = group * group_size
         pool.masks[place, bit >> 6] |= new << np.uint64(bit & 63)
         if known | new == full:
             group_filled = np.int64(1)
-    if group_filled == 1 and switches.umbra_bits and _is_full(pool, place):
+    if group_filled == 1 and switches.umbra_bits and is_full(pool, place):
         pool.state[1] += 1
         if switches.lazy_masks:
-            _release_mask(pool, row, counters)
+            release_mask(pool, row, counters)
         else:
             pool.place[row] = MASK_UMBRA
     return group_filled
@@ -230,19 +170,16 @@ def _narrow_groups(node, level, bvh, volumes_built, light, switches, scratch, co
 
 
 @inlined
-def _cast_on_leaf(
-    tri, tri_id, tri_side, node, level, built, extent, amplify, bvh, pool, light, group_size, switches, scratch,
-    counters,
-):  # fmt: skip
+def _cast_on_leaf(blocker, node, level, built, bvh, pool, light, group_size, switches, scratch, counters):
     """Test the receivers of a leaf; returns (status: -1 pool empty, 1 a group became full; volumes built)."""
     status = np.int64(0)
     planes = scratch.light_planes[level]
-    for slot in range(bvh.first[node], bvh.first[node] + bvh.count[node]):
+    for slot in range(bvh.first[node], bvh.first[node] + bvh.n_slots[node]):
         place = pool.place[bvh.row[slot]]
         if place == MASK_UMBRA:
             counters[UMBRA_RECEIVERS_SKIPPED] += 1
             continue
-        if bvh.own[slot] == tri_id:
+        if bvh.own[slot] == blocker.id:
             continue
         if planes != 0:
             counters[PLANE_POINT_TESTS] += popcount64(np.uint64(planes))
@@ -250,10 +187,10 @@ def _cast_on_leaf(
             if not contains_point(scratch.light_volume, 0, planes, x, y, z):
                 continue
         if not built:
-            _build_group_volumes(tri, light, extent, amplify, scratch, counters)
+            _build_group_volumes(blocker, light, scratch, counters)
             built = True
         found = _cast_on_receiver(
-            tri, tri_side, slot, level, bvh, pool, light, group_size, switches, scratch, counters
+            blocker, slot, level, bvh, pool, light, group_size, switches, scratch, counters
         )
         if found < 0:
             return np.int64(-1), built
@@ -262,51 +199,44 @@ def _cast_on_leaf(
 
 
 @helper
-def _start_blocker(tri, shaft, light, switches, scratch, counters):
-    """Build V_L and the first level; returns (side of the blocker the light is on, amplify, built)."""
-    fill_blocker(tri, scratch.blocker)
+def _start_blocker(tri, tri_id, shaft, light, scratch, counters):
+    """Build V_L, activate all groups, and return the Blocker (HPC figure 3, lines 30 to 33)."""
+    fill_normal(tri, scratch.normal)
     extent = shaft.extent
     for k in range(3):
         for axis in range(3):
             extent = max(extent, abs(tri[k, axis]))
-    tri_side = light_side(tri, scratch.blocker, light, extent)
     gap = light_gap(tri, light)
     amplify = shaft.reach / gap if gap > 0.0 else np.inf
-    n_groups = light.full_groups.shape[0]
-    scratch.choices[0, :] = -1
+    blocker = Blocker(tri, tri_id, light_side(tri, scratch.normal, light, extent), extent, amplify)
+    choices = scratch.choices[0]
+    choices[:] = -1
     if amplify < np.inf:
         scratch.light_planes[0] = fill_volume(
-            tri, scratch.blocker, light, 0, extent, amplify, scratch.choices[0], scratch.light_volume
+            blocker, scratch.normal, light, 0, choices, scratch.light_volume
         )
     else:
         # The blocker touches the light: no plane can be trusted, every receiver is tested.
         scratch.light_planes[0] = 0
         scratch.group_found[:] = 0
     counters[LIGHT_VOLUMES_BUILT] += 1
+    n_groups = light.full_groups.shape[0]
     for group in range(n_groups):
         scratch.active_group[0, group] = group
         scratch.active_planes[0, group] = ALL_PLANES
     scratch.n_active[0] = n_groups
-    built = amplify == np.inf
-    if not built and not switches.lazy_volumes:
-        _build_group_volumes(tri, light, extent, amplify, scratch, counters)
-        built = True
-    return tri_side, extent, amplify, built
-
-
-@helper
-def _leave_node(node, bvh):
-    """A: group-umbra bits of an inner node, the AND of its children (HPC figure 3, lines 50 to 54)."""
-    left = bvh.child[node]
-    for word in range(bvh.umbra.shape[1]):
-        bvh.umbra[node, word] = bvh.umbra[left, word] & bvh.umbra[left + 1, word]
+    return blocker
 
 
 @helper
 def _cast_blocker(tri, tri_id, shaft, bvh, pool, light, group_size, switches, scratch, counters):
     """Cast one blocker through the hierarchy; False if the mask pool ran empty."""
     counters[BLOCKERS_TESTED] += 1
-    tri_side, extent, amplify, built = _start_blocker(tri, shaft, light, switches, scratch, counters)
+    blocker = _start_blocker(tri, tri_id, shaft, light, scratch, counters)
+    built = blocker.amplify == np.inf
+    if not built and not switches.lazy_volumes:
+        _build_group_volumes(blocker, light, scratch, counters)
+        built = True
     umbra_changed = False
     stack = scratch.stack
     stack[0, 0], stack[0, 1] = 0, 1
@@ -317,9 +247,9 @@ def _cast_blocker(tri, tri_id, shaft, bvh, pool, light, group_size, switches, sc
         level = np.int64(stack[height, 1])
         if node < 0:
             if umbra_changed:
-                _leave_node(~node, bvh)
+                update_inner_umbra(~node, bvh)
             continue
-        if switches.umbra_bits and _node_is_umbra(bvh, node, light.full_groups.shape[0]):
+        if switches.umbra_bits and node_is_umbra(bvh, node, light.full_groups.shape[0]):
             counters[UMBRA_NODES_SKIPPED] += 1
             continue
         counters[NODES_VISITED] += 1
@@ -343,13 +273,12 @@ def _cast_blocker(tri, tri_id, shaft, bvh, pool, light, group_size, switches, sc
             height += 2
             continue
         status, built = _cast_on_leaf(
-            tri, tri_id, tri_side, node, level, built, extent, amplify, bvh, pool, light, group_size, switches,
-            scratch, counters,
-        )  # fmt: skip
+            blocker, node, level, built, bvh, pool, light, group_size, switches, scratch, counters
+        )
         if status < 0:
             return False
         if status > 0 and switches.umbra_bits:
-            _update_leaf_umbra(bvh, node, pool, light, group_size)
+            update_leaf_umbra(bvh, node, pool, light, group_size)
             umbra_changed = True
     return True
 
@@ -388,14 +317,3 @@ def cast_blockers(chunk, start, rebuild_at, shaft, bvh, pool, light, group_size,
         if pool.state[1] >= rebuild_at:
             return t, REBUILD
     return n_blockers, DONE
-
-
-@kernel
-def fill_umbra(bvh, n_nodes, pool, light, group_size):
-    """Group-umbra bits of all nodes of a new hierarchy, children before parents."""
-    for k in range(n_nodes):
-        node = n_nodes - 1 - k
-        if bvh.child[node] < 0:
-            _update_leaf_umbra(bvh, node, pool, light, group_size)
-        else:
-            _leave_node(node, bvh)

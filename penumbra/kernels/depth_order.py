@@ -91,23 +91,14 @@ def _fill_dot(u, v, pair, out):
 
 
 @helper
-def _fill_difference(row, p, q, plus, minus):
-    """Write a difference of points as row `row` of the exact matrix plus - minus."""
-    plus[row, 0], plus[row, 1], plus[row, 2] = p
-    minus[row, 0], minus[row, 1], minus[row, 2] = q
-
-
-@helper
 def _integer_rows(new, old, eye, q):
     """The rows as integers, uint64 (7, 3, n_limbs), long enough for a product of two determinants."""
+    ends = new[0], old[0], q, new[1], new[2], old[1], old[2]
+    starts = eye, eye, eye, new[0], new[0], old[0], old[0]
     plus, minus = np.empty((_N_ROWS, 3)), np.empty((_N_ROWS, 3))
-    _fill_difference(_NEW, new[0], eye, plus, minus)
-    _fill_difference(_OLD, old[0], eye, plus, minus)
-    _fill_difference(_RAY, q, eye, plus, minus)
-    _fill_difference(_NEW_AB, new[1], new[0], plus, minus)
-    _fill_difference(_NEW_AC, new[2], new[0], plus, minus)
-    _fill_difference(_OLD_AB, old[1], old[0], plus, minus)
-    _fill_difference(_OLD_AC, old[2], old[0], plus, minus)
+    for row in range(_N_ROWS):
+        plus[row, 0], plus[row, 1], plus[row, 2] = ends[row]
+        minus[row, 0], minus[row, 1], minus[row, 2] = starts[row]
     lows, highs = np.empty(_N_ROWS, np.int64), np.empty(_N_ROWS, np.int64)
     for row in range(_N_ROWS):
         low, row_bits = _row_range(plus[row], minus[row])

@@ -14,7 +14,14 @@ from penumbra.kernels._jit import helper, inlined
 from penumbra.kernels.counters import ESCALATED_EXACT
 from penumbra.kernels.lanes import bits_above, bits_not_below, lesser, load, splat
 from penumbra.kernels.penumbra_volume import cross
-from penumbra.kernels.predicates import DET_BOUND, UNDECIDED, UNDERFLOW, UNIT_ROUNDOFF, orient3d_exact, sign_of
+from penumbra.kernels.predicates import (
+    DET_BOUND,
+    UNDECIDED,
+    UNDERFLOW,
+    UNIT_ROUNDOFF,
+    orient3d_exact,
+    sign_of,
+)
 
 # Lanes: coefficients scaled to at most 1, |s|, |t| <= 1/2. In units of 2**-24 the rounding of A, B, C
 # gives 2, of s and t 1, of the two products 1, of the two sums 3.5: 7.5, so 8.
@@ -27,23 +34,23 @@ _ONE = np.uint64(1)
 
 
 @helper
-def fill_blocker(tri, blocker):
-    """Set blocker (6,): normal (b - a) x (c - a), and the permanents of its three components."""
+def fill_normal(tri, normal):
+    """Set normal (6,): normal (b - a) x (c - a), and the permanents of its three components."""
     ux, uy, uz = tri[1, 0] - tri[0, 0], tri[1, 1] - tri[0, 1], tri[1, 2] - tri[0, 2]
     vx, vy, vz = tri[2, 0] - tri[0, 0], tri[2, 1] - tri[0, 1], tri[2, 2] - tri[0, 2]
-    blocker[0], blocker[1], blocker[2] = cross(ux, uy, uz, vx, vy, vz)
-    blocker[3] = abs(uy * vz) + abs(uz * vy)
-    blocker[4] = abs(uz * vx) + abs(ux * vz)
-    blocker[5] = abs(ux * vy) + abs(uy * vx)
+    normal[0], normal[1], normal[2] = cross(ux, uy, uz, vx, vy, vz)
+    normal[3] = abs(uy * vz) + abs(uz * vy)
+    normal[4] = abs(uz * vx) + abs(ux * vz)
+    normal[5] = abs(ux * vy) + abs(uy * vx)
 
 
 @inlined
-def receiver_side(tri, blocker, x, y, z, counters):
+def receiver_side(tri, normal, x, y, z, counters):
     """Exact side of the blocker's plane on which a receiver lies: -1, 0 or 1."""
     px, py, pz = x - tri[0, 0], y - tri[0, 1], z - tri[0, 2]
-    permanent = abs(px) * blocker[3] + abs(py) * blocker[4] + abs(pz) * blocker[5]
+    permanent = abs(px) * normal[3] + abs(py) * normal[4] + abs(pz) * normal[5]
     tiny = UNDERFLOW * (1.0 + abs(px) + abs(py) + abs(pz))
-    side = sign_of(px * blocker[0] + py * blocker[1] + pz * blocker[2], DET_BOUND * permanent + tiny)
+    side = sign_of(px * normal[0] + py * normal[1] + pz * normal[2], DET_BOUND * permanent + tiny)
     if side == UNDECIDED:
         counters[ESCALATED_EXACT] += 1
         side = orient3d_exact(
@@ -54,19 +61,19 @@ def receiver_side(tri, blocker, x, y, z, counters):
 
 
 @helper
-def light_side(tri, blocker, light, extent):
+def light_side(tri, normal, light, extent):
     """Side of the blocker's plane on which every sample of the light lies for certain, or 0."""
     lowest = np.inf
     highest = -np.inf
     for j in range(4):
         height = (
-            blocker[0] * (light.corners[0, j, 0] - tri[0, 0])
-            + blocker[1] * (light.corners[0, j, 1] - tri[0, 1])
-            + blocker[2] * (light.corners[0, j, 2] - tri[0, 2])
+            normal[0] * (light.corners[0, j, 0] - tri[0, 0])
+            + normal[1] * (light.corners[0, j, 1] - tri[0, 1])
+            + normal[2] * (light.corners[0, j, 2] - tri[0, 2])
         )
         lowest = min(lowest, height)
         highest = max(highest, height)
-    permanent = blocker[3] + blocker[4] + blocker[5]
+    permanent = normal[3] + normal[4] + normal[5]
     bound = permanent * (32.0 * UNIT_ROUNDOFF * extent + 4.0 * light.residual) + UNDERFLOW
     if lowest > bound:
         return np.int64(1)
@@ -90,12 +97,13 @@ def _set_edge(k, a, b, c, error, edges):
 
 
 @inlined
-def fill_edges(tri, blocker, side, x, y, z, light, light_norm, straddles, edges):
+def fill_edges(blocker, normal, side, x, y, z, light, light_norm, edges):
     """Set edges (4, 4): functions A + B s + C t, >= 0 where the sample may be blocked, and their bounds.
 
     side: the receiver's side of the blocker's plane (not 0); light_norm: |edge_u|_1 + |edge_v|_1.
     The fourth function, the plane of the blocker, is needed only where the light straddles it.
     """
+    tri = blocker.corners
     u, v, o = light.edge_u, light.edge_v, light.origin
     gx, gy, gz = o[0] - x, o[1] - y, o[2] - z
     reach = _COEFFICIENT_BOUND * (abs(gx) + abs(gy) + abs(gz) + light_norm) + light.residual
@@ -115,8 +123,8 @@ def fill_edges(tri, blocker, side, x, y, z, light, light_norm, straddles, edges)
             size * reach,
             edges,
         )
-    if straddles:
-        nx, ny, nz = blocker[0] * flip, blocker[1] * flip, blocker[2] * flip
+    if blocker.side == 0:
+        nx, ny, nz = normal[0] * flip, normal[1] * flip, normal[2] * flip
         hx, hy, hz = o[0] - tri[0, 0], o[1] - tri[0, 1], o[2] - tri[0, 2]
         reach = _COEFFICIENT_BOUND * (abs(hx) + abs(hy) + abs(hz) + light_norm) + light.residual
         _set_edge(
@@ -124,7 +132,7 @@ def fill_edges(tri, blocker, side, x, y, z, light, light_norm, straddles, edges)
             nx * hx + ny * hy + nz * hz,
             nx * u[0] + ny * u[1] + nz * u[2],
             nx * v[0] + ny * v[1] + nz * v[2],
-            (blocker[3] + blocker[4] + blocker[5]) * reach,
+            (normal[3] + normal[4] + normal[5]) * reach,
             edges,
         )
     else:

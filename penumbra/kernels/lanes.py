@@ -13,11 +13,10 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 
-class Lanes(types.Type):
+class Lanes(types.Type):  # type: ignore[misc]
     """numba type of a vector of `count` floats."""
 
     def __init__(self, element: types.Float, count: int) -> None:
@@ -114,7 +113,7 @@ _bits_not_below = _comparison(">=")
 
 def _overload_operator(symbol: Any, apply: Any) -> None:
     @overload(symbol)
-    def typed(left, right):  # type: ignore[no-untyped-def]
+    def typed(left, right):
         if isinstance(left, Lanes) and left == right:
             return lambda left, right: apply(left, right)
         return None
@@ -130,27 +129,27 @@ def _packed(lanes: np.ndarray) -> np.int64:
 
 if numba.config.DISABLE_JIT:
 
-    def load(array, offset):  # type: ignore[no-untyped-def]
+    def load(array, offset):
         """Lanes from a C-contiguous array, from a flat element offset on."""
         return array.reshape(-1)[offset : offset + (16 if array.dtype == np.float32 else 8)]
 
-    def splat(value):  # type: ignore[no-untyped-def]
+    def splat(value):
         """Lanes that all hold one float32 or float64."""
         return np.full(16 if isinstance(value, np.float32) else 8, value)
 
-    def lesser(left, right):  # type: ignore[no-untyped-def]
+    def lesser(left, right):
         """Lesser of two vectors, by lane."""
         return np.minimum(left, right)
 
-    def greater(left, right):  # type: ignore[no-untyped-def]
+    def greater(left, right):
         """Greater of two vectors, by lane."""
         return np.maximum(left, right)
 
-    def bits_above(left, right):  # type: ignore[no-untyped-def]
+    def bits_above(left, right):
         """Bit k is set where lane k of left > right; int64."""
         return _packed(left > right)
 
-    def bits_not_below(left, right):  # type: ignore[no-untyped-def]
+    def bits_not_below(left, right):
         """Bit k is set where lane k of left >= right; int64."""
         return _packed(left >= right)
 

@@ -128,15 +128,16 @@ def _light_edge_normal(tri, corners, polygon, edge, vertex):
 
 
 @helper
-def fill_volume(tri, tri_normal, light, polygon, extent, amplify, choices, planes):
+def fill_volume(blocker, normal, light, polygon, choices, planes):
     """Set planes (4, 8) to the penumbra volume of a blocker and a polygon of the light; return its set.
 
-    polygon 0 is the whole light, 1 + g a group. tri_normal (3,): normal of the blocker. extent: largest
-    coordinate that occurs; amplify: bound of k (module docstring). choices (7,) holds, and is given,
+    polygon 0 is the whole light, 1 + g a group. normal: that of the blocker; its `amplify` bounds k
+    (module docstring). choices (7,) holds, and is given,
     the corner that each of the first seven planes went through: that of the whole light is nearly
     always right for its groups, which saves three quarters of the candidates.
     """
     found = np.int64(0)
+    tri, extent, amplify = blocker.corners, blocker.extent, blocker.amplify
     residual = light.residual
     corners = light.corners
     for k in range(7):
@@ -156,7 +157,7 @@ def fill_volume(tri, tri_normal, light, polygon, extent, amplify, choices, plane
         if choices[k] == _NO_CHOICE:
             planes[0, k] = planes[1, k] = planes[2, k] = 0.0
             planes[3, k] = 1.0
-    nx, ny, nz = tri_normal[0], tri_normal[1], tri_normal[2]
+    nx, ny, nz = normal[0], normal[1], normal[2]
     if _place_plane(nx, ny, nz, tri, corners, polygon, extent, amplify, residual, planes, 7) or _place_plane(
         -nx, -ny, -nz, tri, corners, polygon, extent, amplify, residual, planes, 7
     ):
@@ -173,7 +174,12 @@ def clip_box(planes, first, active, boxes, node):
     planes: array that holds the volume (4, 8) from flat offset `first` on. HPC section 3.3 B: a plane
     that has the whole box inside needs no test below that node.
     """
-    nx, ny, nz, d = load(planes, first), load(planes, first + 8), load(planes, first + 16), load(planes, first + 24)
+    nx, ny, nz, d = (
+        load(planes, first),
+        load(planes, first + 8),
+        load(planes, first + 16),
+        load(planes, first + 24),
+    )
     x0, x1 = nx * splat(boxes[node, 0]), nx * splat(boxes[node, 3])
     y0, y1 = ny * splat(boxes[node, 1]), ny * splat(boxes[node, 4])
     z0, z1 = nz * splat(boxes[node, 2]), nz * splat(boxes[node, 5])
@@ -188,6 +194,11 @@ def clip_box(planes, first, active, boxes, node):
 @inlined
 def contains_point(planes, first, active, x, y, z):
     """Whether a point is inside all active planes of the volume at flat offset `first`."""
-    nx, ny, nz, d = load(planes, first), load(planes, first + 8), load(planes, first + 16), load(planes, first + 24)
+    nx, ny, nz, d = (
+        load(planes, first),
+        load(planes, first + 8),
+        load(planes, first + 16),
+        load(planes, first + 24),
+    )
     height = (nx * splat(x) + ny * splat(y)) + (nz * splat(z) + d)
     return bits_above(splat(0.0), height) & active == 0

@@ -1,6 +1,8 @@
-"""The shaft between a tile of receivers and the light (Haines & Wallace 1991): whole boxes outside it
-can block nothing there. Its planes bound both boxes in twelve directions, so any rounding of a
-direction is harmless."""
+"""The shaft between a tile of receivers and the light (Haines & Wallace 1991).
+
+Whole boxes outside it can block nothing there. Its planes bound both boxes in twelve directions, so
+any rounding of a direction is harmless.
+"""
 
 import numpy as np
 
