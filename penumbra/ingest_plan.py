@@ -79,8 +79,8 @@ def plan_memory(before_bytes: int, limit_bytes: int, chunk_triangles: int) -> Me
     )
 
 
-def estimate_triangles(meshes: Iterable[MeshRef]) -> tuple[int, bool]:
-    """About how many triangles the inputs hold, and whether all headers promise float32 coordinates.
+def estimate_triangles(meshes: Iterable[MeshRef]) -> tuple[int, np.dtype[Any]]:
+    """About how many triangles the inputs hold, and the type of their coordinates as headers promise it.
 
     The number is exact where headers have it. Raises MeshError or BlockerStoreError.
     """
@@ -99,7 +99,7 @@ def estimate_triangles(meshes: Iterable[MeshRef]) -> tuple[int, bool]:
             else:
                 is_text = mesh.path.suffix.lower() == ".obj"
                 total += reader.size_bytes // (_TEXT_TRIANGLE_BYTES if is_text else _BINARY_TRIANGLE_BYTES)
-    return total, is_float32
+    return total, np.dtype(np.float32 if is_float32 else np.float64)
 
 
 def store_bytes(n_triangles: int, coordinates: np.dtype[Any]) -> int:
@@ -110,7 +110,7 @@ def store_bytes(n_triangles: int, coordinates: np.dtype[Any]) -> int:
 def check_disk(
     n_triangles: int,
     coordinates: np.dtype[Any],
-    run_records: int,
+    plan: MemoryPlan,
     scratch: Path,
     output: Path,
     written_bytes: int = 0,
@@ -120,8 +120,9 @@ def check_disk(
     At the worst moment the scratch folder holds all bins and, where a bucket does not fit in memory, all
     sorted runs; or the runs, and the output the store. `written_bytes` of the bins are there already.
     """
+    needs_runs = n_triangles > plan.sort_plan(coordinates).run_records
     unsorted = n_triangles * record_dtype(coordinates, keyed=False).itemsize
-    runs = n_triangles * record_dtype(coordinates, keyed=True).itemsize if n_triangles > run_records else 0
+    runs = n_triangles * record_dtype(coordinates, keyed=True).itemsize if needs_runs else 0
     store = store_bytes(n_triangles, coordinates)
     if os.stat(scratch).st_dev == os.stat(output.parent).st_dev:
         needs = [(output.parent, runs + max(unsorted, store))]

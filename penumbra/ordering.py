@@ -4,12 +4,13 @@ Every function depends on nothing but its arguments and breaks ties by id, so a 
 on the memory or the batches it was made with.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from penumbra.arrays import BlockerChunk, Float64Array, Int64Array, UInt64Array
-from penumbra.io.buckets import bounds_of
+from penumbra.io.buckets import AreaBin, Bucket, bounds_of, merge_bins
 from penumbra.kernels.order import (
     RUN,
     fill_axis_orders,
@@ -20,6 +21,7 @@ from penumbra.kernels.order import (
     fill_unit_boxes,
     sort_by_surface_area,
 )
+from penumbra.options import IngestOptions
 
 
 class Measures(NamedTuple):
@@ -27,6 +29,12 @@ class Measures(NamedTuple):
 
     areas: Float64Array  # (n,), -1 where exactly zero
     centres: Float64Array  # (n, 3) centres of the boxes
+
+
+def choose_buckets(histogram: Mapping[int, AreaBin], options: IngestOptions) -> list[Bucket]:
+    """Buckets for a histogram of areas, from large triangles to small."""
+    # A bucket smaller than this is better off in its neighbour: every chunk costs a read and a descent.
+    return merge_bins(histogram, options.max_buckets, least_triangles=options.chunk_triangles // 4)
 
 
 def measure(vertices: Float64Array) -> Measures:
@@ -41,6 +49,11 @@ def curve_keys(centres: Float64Array, bounds: Float64Array) -> UInt64Array:
     keys = np.empty(len(centres), np.uint64)
     fill_curve_keys(centres, bounds, keys)
     return keys
+
+
+def bucket_keys(centres: Float64Array, ids: Int64Array, bounds: Float64Array, sort: bool) -> UInt64Array:
+    """What a bucket is sorted by: places along the curve; the ids where input order is to be kept."""
+    return curve_keys(centres, bounds) if sort else ids.astype(np.uint64)
 
 
 def sort_by_key(keys: UInt64Array, ids: Int64Array) -> Int64Array:

@@ -1,11 +1,27 @@
 """The signs that decide bits, against rationals: where float64 suffices, where it does not, and beyond it."""
 
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numba
 import numpy as np
 import oracle
 import pytest
 from scenes import Floats
 
-from penumbra.kernels import predicates
+from penumbra.kernels import predicates as helpers
+
+
+def from_python(name: str) -> Callable[..., Any]:
+    """A predicate that Python can call: helpers are compiled for kernels only."""
+    helper = getattr(helpers, name)
+    call: Callable[..., Any] = numba.njit(lambda *values: helper(*values))
+    return call
+
+
+NAMES = ("orient3d_sign", "edges_side_sign", "dot_difference_sign", "is_zero_area")
+predicates = SimpleNamespace(**{name: from_python(name) for name in NAMES})
 
 # Powers of ten for which products of three differences are ordinary, underflow, are subnormal, overflow.
 EXPONENTS = [0, -6, 6, -105, -160, -307, -320, 90, 150, 307]

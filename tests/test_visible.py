@@ -1,6 +1,7 @@
 """Primary visibility against exact rationals, closed rooms, Embree, and itself under other orders."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -202,6 +203,37 @@ def test_scenes_at_any_scale_and_offset(rng, scale, offset):
         assert_exact(triangles * scale + move, camera, chunk=7)
 
 
+@pytest.mark.parametrize("offset", [0.0, 1e3, 1e6])
+def test_edges_within_rounding_of_pixel_centres(rng, offset):
+    # Every corner is a point of some pixel's ray, rounded: float64 alone cannot tell on which side.
+    eye = np.array([0.3, 0.2, 2.5]) + offset * np.array([1.0, -0.7, 0.3])
+    camera = Camera(tuple(eye), tuple(eye - np.array([0.1, 0.2, 3.0])), vfov=40, resolution=(40, 4))
+    frame = camera.frame()
+    for _ in range(4):
+        x, y = rng.integers(0, 40, (12, 3, 1)), rng.integers(0, 4, (12, 3, 1))
+        q = frame.eye + ((frame.d0 + y * frame.dy) + x * frame.dx)
+        triangles = frame.eye + (q - frame.eye) * rng.uniform(0.1, 9.0, (12, 3, 1))
+        triangles[6:, 2] += rng.normal(size=(6, 3))
+        counters: dict[str, int] = {}
+        assert_exact(triangles, camera, list(rng.permutation(12)), counters=counters)
+        assert counters["escalated_exact"] > 0
+
+
+def test_depths_closer_than_float32(rng):
+    # Small triangles one behind the other by 1e-7 to 1e-16 of their distance, or crossing there.
+    for exponent in range(7, 17):
+        start = rng.normal(size=(6, 1, 3)) * 0.5 + rng.normal(size=(6, 3, 3)) * 0.08
+        copies = [start + rng.normal(size=(6, 3, 3)) * 10.0**-exponent for _ in range(4)]
+        large = rng.normal(size=(2, 3, 3)) + np.array([0, 0, -1.0])
+        wide = [large + rng.normal(size=(2, 3, 3)) * 10.0**-exponent for _ in range(3)]
+        camera = Camera((0.1, 0.2, 4.0), (0, 0, 0), vfov=40, resolution=(20, 12))
+        triangles = np.concatenate([*copies, *wide])
+        counters: dict[str, int] = {}
+        order = rng.permutation(len(triangles))
+        assert_exact(triangles[order], camera, order, chunk=9, counters=counters)
+        assert exponent < 8 or counters["depths_compared"] > 0
+
+
 @pytest.mark.parametrize("power", [-700, -400, 300, 340, 400])
 def test_numbers_that_overflow_or_underflow(rng, power):
     triangles = np.ldexp(rng.integers(-6, 7, size=(15, 3, 3)).astype(np.float64), power)
@@ -381,8 +413,14 @@ print(n, status("VmHWM") - before)
 def test_window_bytes_are_the_memory_of_a_window():
     if not Path("/proc/self/clear_refs").exists():
         pytest.skip("this system does not tell the peak memory of a stretch of code")
+    tests = Path(__file__).parent
     run = subprocess.run(
-        [sys.executable, "-c", _PEAK], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        [sys.executable, "-c", _PEAK],
+        cwd=tests,
+        env={**os.environ, "PYTHONPATH": str(tests.parent)},
+        capture_output=True,
+        text=True,
+        check=True,
     )
     n_pixels, peak_bytes = map(int, run.stdout.split())
     assert n_pixels == 1920 * 1440

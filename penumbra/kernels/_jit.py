@@ -37,11 +37,13 @@ numba.config.CACHE_DIR = str(cache_folder())
 # error_model="numpy": with Python's division check loops do not vectorise. No fastmath: `contract`
 # breaks the antisymmetry of edge functions along a shared edge, `nnan` breaks tests against infinity.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": False}
+# Without wrappers for callers other than kernels: a third of the cold compile of all kernels.
+_HELPER_OPTIONS = _OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
 def helper(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Jit a function that only kernels call; it is compiled into its callers and not cached itself."""
-    jitted: Callable[..., Any] = numba.njit(**_OPTIONS)(function)
+    """Jit a function that only kernels call (Python cannot); compiled into its callers, not cached itself."""
+    jitted: Callable[..., Any] = numba.njit(**_HELPER_OPTIONS)(function)
     return jitted
 
 
@@ -51,11 +53,11 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     A call passes eight words for every array of every tuple, some 300 for a casting step: left to
     LLVM's own judgement those calls were most of the time of casting.
     """
-    jitted: Callable[..., Any] = numba.njit(forceinline=True, **_OPTIONS)(function)
+    jitted: Callable[..., Any] = numba.njit(forceinline=True, **_HELPER_OPTIONS)(function)
     return jitted
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Jit a serial loop kernel called from Python: releases the GIL, kept in the cache folder."""
-    jitted: Callable[..., Any] = numba.njit(cache=True, **_OPTIONS)(function)
+    jitted: Callable[..., Any] = numba.njit(cache=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
     return jitted
