@@ -83,6 +83,7 @@ class LightSamples(NamedTuple):
     parameters: Float32Array  # (S, 2, P) s and t, in [-1/2, 1/2]
     points: Float64Array  # (S, P, 3) the samples themselves, world space
     corners: Float64Array  # (1 + G, 4, 3) bounding polygons: the whole light, then each group; all sets
+    n_samples: int  # K
     full_groups: UInt64Array  # (G,) the bits of a group that stand for samples, lowest bit first
     residual: float  # largest distance per axis of a sample from its parametric position
 

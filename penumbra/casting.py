@@ -51,7 +51,8 @@ def cast_receivers(
         masks[facing.state == FACES_NONE] = full_mask(light.samples)
         masks[facing.rows] = facing.masks
         live = np.flatnonzero(facing.state != FACES_NONE)
-        tiles = _make_tiles(receivers, live, sample_sets, masks, samples, light.samples, options, threads)
+        extent = float(np.abs(blockers.bounds).max()) if blockers.n_triangles else 0.0
+        tiles = _make_tiles(receivers, live, sample_sets, masks, samples, extent, options, threads)
     with stats.timed("cast"):
         counters = _cast_chunks(tiles, blockers, samples, options, threads, progress, stats)
     for tile in tiles:
@@ -66,12 +67,13 @@ def _make_tiles(
     sample_sets: UInt8Array,
     masks: UInt64Array,
     samples: LightSamples,
-    n_samples: int,
+    blocker_extent: float,
     options: CastOptions,
     threads: int,
 ) -> list[ReceiverTile]:
     """Tiles of the receivers that face the light, with their hierarchies built."""
     partial = np.asarray(masks.any(axis=1))
+    full = full_mask(samples.n_samples)
 
     def make(rows: np.ndarray) -> ReceiverTile:
         tile = ReceiverTile(
@@ -79,7 +81,8 @@ def _make_tiles(
             receivers,
             sample_sets,
             samples,
-            full_mask(n_samples),
+            full,
+            blocker_extent=blocker_extent,
             group_size=options.group_size,
             leaf_receivers=options.leaf_receivers,
             lazy_masks=options.lazy_masks,

@@ -15,7 +15,7 @@ import numpy as np
 
 from penumbra.arrays import Int64Array
 from penumbra.blockers import MemoryBlockers
-from penumbra.errors import OutputError, SceneError
+from penumbra.errors import MeshError, OutputError, SceneError
 from penumbra.io.atomic import atomic_path, check_output, remove_dead_temporaries
 from penumbra.memory import call_limit_bytes, resident_bytes
 from penumbra.options import IngestOptions, parse_size
@@ -52,7 +52,7 @@ def ingest(
         The store; it appears when it is whole.
     memory
         Bytes that this call may add to the resident memory, or a size such as "1GiB"; None is half of the
-        free memory. With `process_limit` the limit is of the whole process. It changes no byte of `/buckets`.
+        free memory. With `process_limit` the limit is of the whole process. It changes nothing in the store.
     overwrite
         Replace `output` if it is there.
     skip_bad
@@ -75,22 +75,18 @@ def ingest(
     progress = progress or NullProgress()
 
     from penumbra.ingest_plan import check_disk, estimate_triangles, plan_memory
-    from penumbra.ingest_sources import SourceStream, checked_inputs
+    from penumbra.ingest_sources import SourceStream
     from penumbra.ingest_store import distribute, write_store
     from penumbra.io.blocker_store import open_store
-    from penumbra.io.runs import Scratch, remove_dead_scratch, scratch_folder
+    from penumbra.io.runs import Scratch, scratch_folder
 
-    inputs = checked_inputs(meshes)
+    inputs = _checked_inputs(meshes)
     # Written through a link, as atomic_path does: scratch and temporaries stand beside the file itself.
     output = Path(os.path.realpath(output))
     parent = Path(scratch) if scratch is not None else output.parent
-    _check_output(output, inputs, parent, overwrite)
-    for folder in {output.parent, parent}:
-        remove_dead_scratch(output, folder)
-    remove_dead_temporaries(output)
-
+    _prepare_output(output, inputs, parent, overwrite)
     blockers_in_memory(np.tri(3)[None])  # loads the kernels, compiled if need be
-    plan = plan_memory(before_bytes, limit_bytes, options.chunk_triangles)
+    plan = plan_memory(before_bytes, limit_bytes, options.chunk_triangles, process_limit)
     check_disk(*estimate_triangles(inputs), plan, parent, output)
     with scratch_folder(output, parent) as folder, atomic_path(output) as temporary:
         stream = SourceStream(
@@ -101,7 +97,6 @@ def ingest(
             scratch=folder,
             progress=progress,
         )
-        progress.stage("ingest: reading", sum(mesh.path.stat().st_size for mesh in inputs), "B")
         found = distribute(stream, Scratch(folder), options.sort)
         check_disk(
             found.counts.n_triangles, found.files.coordinates, plan, folder, output, found.files.n_bytes
@@ -124,17 +119,37 @@ def blockers_in_memory(
     Raises SceneError for an array that is not usable, MeshError for a mesh.
     """
     from penumbra.ingest_memory import blockers_of_array, blockers_of_meshes
-    from penumbra.ingest_sources import checked_inputs, names_meshes
 
     options = options or IngestOptions()
     progress = progress or NullProgress()
-    if names_meshes(triangles):
-        return blockers_of_meshes(checked_inputs(triangles), options, skip_bad, progress)
+    if _names_meshes(triangles):
+        return blockers_of_meshes(_checked_inputs(triangles), options, skip_bad, progress)
     return blockers_of_array(triangles, ids, options, progress)
 
 
-def _check_output(output: Path, inputs: Sequence[MeshRef], scratch: Path, overwrite: bool) -> None:
-    """Refuse what could not be written at the end."""
+def _names_meshes(value: Any) -> bool:
+    """Whether an argument is a mesh or several (and not an array of triangles)."""
+    if isinstance(value, list | tuple) and value:
+        value = value[0]
+    return isinstance(value, str | Path | MeshRef)
+
+
+def _checked_inputs(meshes: Sequence[PathLike | MeshRef] | PathLike | MeshRef) -> list[MeshRef]:
+    """Meshes as MeshRefs, at least one, all of them existing files; MeshError names those that are not."""
+    several = [meshes] if isinstance(meshes, str | Path | MeshRef) else list(meshes)
+    refs = [mesh if isinstance(mesh, MeshRef) else MeshRef(Path(mesh)) for mesh in several]
+    if not refs:
+        raise MeshError("there is no mesh to ingest: name at least one file")
+    missing = [str(ref.path) for ref in refs if not ref.path.exists()]
+    if missing:
+        raise MeshError(f"{', '.join(missing)}: no such file; check the path")
+    return refs
+
+
+def _prepare_output(output: Path, inputs: Sequence[MeshRef], scratch: Path, overwrite: bool) -> None:
+    """Refuse what could not be written at the end, and remove what a killed run left behind."""
+    from penumbra.io.runs import remove_dead_scratch
+
     check_output(output)
     if output.exists() and not overwrite:
         raise OutputError(f"{output} is there already: choose another output, or allow to overwrite it")
@@ -142,3 +157,6 @@ def _check_output(output: Path, inputs: Sequence[MeshRef], scratch: Path, overwr
         raise SceneError(f"{output} is an input of this ingest: choose another output")
     if not scratch.is_dir():
         raise OutputError(f"{scratch}: there is no such folder for scratch files; create it first")
+    for folder in {output.parent, scratch}:
+        remove_dead_scratch(output, folder)
+    remove_dead_temporaries(output)

@@ -1,19 +1,21 @@
 """2: triangles of an array or of meshes as blockers in memory, ordered as a store would have them."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from penumbra.arrays import BlockerChunk, Int64Array, TriangleBatch
 from penumbra.blockers import MemoryBlockers
 from penumbra.errors import SceneError
-from penumbra.ingest_sources import SourceStream
 from penumbra.io.buckets import AreaBin, split_by_bin
 from penumbra.options import IngestOptions
 from penumbra.ordering import bucket_keys, choose_buckets, measure, order_chunk, sort_by_key
 from penumbra.progress import Progress
 from penumbra.scene import MeshRef
+
+if TYPE_CHECKING:
+    from penumbra.ingest_sources import SourceStream
 
 # The vertices of a reader are a small part of what is held here: they never go to a scratch file.
 _NO_LIMIT_BYTES = 1 << 40
@@ -24,7 +26,9 @@ def blockers_of_meshes(
     inputs: Sequence[MeshRef], options: IngestOptions, skip_bad: bool, progress: Progress
 ) -> MemoryBlockers:
     """Read meshes, and order their triangles."""
-    progress.stage("ingest: reading", sum(mesh.path.stat().st_size for mesh in inputs), "B")
+    # Imported here: an array needs no readers and no HDF5.
+    from penumbra.ingest_sources import SourceStream
+
     stream = SourceStream(
         inputs,
         skip_bad=skip_bad,
@@ -62,7 +66,7 @@ def _ordered(
     return buckets, int((areas < 0).sum())
 
 
-def _read_whole(stream: SourceStream) -> TriangleBatch:
+def _read_whole(stream: "SourceStream") -> TriangleBatch:
     """All triangles of a stream, vertices in float64."""
     batches = list(stream.batches())
     ids = np.concatenate([batch.ids for batch in batches])

@@ -51,7 +51,7 @@ class MemoryPlan(NamedTuple):
         )
 
 
-def plan_memory(before_bytes: int, limit_bytes: int, chunk_triangles: int) -> MemoryPlan:
+def plan_memory(before_bytes: int, limit_bytes: int, chunk_triangles: int, process_limit: bool) -> MemoryPlan:
     """Share out `limit_bytes` above `before_bytes`, the resident memory when ingest began.
 
     What libraries and kernels took since is in it. Raises MemoryLimitError, with the figure that would
@@ -65,9 +65,11 @@ def plan_memory(before_bytes: int, limit_bytes: int, chunk_triangles: int) -> Me
         chunk_bytes + _LEAST_SORT_BYTES,
     )
     if working < least:
+        # In the terms of whoever set the limit: of the whole process, or of what ingest adds to it.
+        outside = before_bytes if process_limit else 0
         raise MemoryLimitError(
-            f"ingest needs {format_bytes(taken_bytes + least)} of memory and the limit is "
-            f"{format_bytes(limit_bytes)}: raise the limit, or use smaller chunks"
+            f"ingest needs {format_bytes(outside + taken_bytes + least)} of memory and the limit is "
+            f"{format_bytes(outside + limit_bytes)}: raise it"
         )
     batch = (working - _READER_LEAST_BYTES - _READER_BUFFERS_BYTES) // 2 // _BATCH_TRIANGLE_BYTES
     batch = max(_LEAST_BATCH, min(_LARGEST_BATCH, batch))

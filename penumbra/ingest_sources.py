@@ -3,7 +3,6 @@
 import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +47,7 @@ class SourceStream:
 
     def batches(self) -> Iterator[TriangleBatch]:
         """Yield the triangles in world space, float32 or float64, with their ids. Raises MeshError."""
+        self._progress.stage("ingest: reading", sum(mesh.path.stat().st_size for mesh in self._meshes), "B")
         for mesh in self._meshes:
             before = mesh.path.stat()
             first_id = self.n_ids
@@ -104,25 +104,6 @@ class SourceStream:
             self.n_ids += store.n_ids
             self.n_bad += store.n_bad
             self.n_dropped += store.n_dropped
-
-
-def names_meshes(value: Any) -> bool:
-    """Whether an argument is a mesh or several (and not an array of triangles)."""
-    if isinstance(value, list | tuple) and value:
-        value = value[0]
-    return isinstance(value, str | Path | MeshRef)
-
-
-def checked_inputs(meshes: Sequence[str | Path | MeshRef] | str | Path | MeshRef) -> list[MeshRef]:
-    """Meshes as MeshRefs, at least one, all of them existing files; MeshError names those that are not."""
-    several = [meshes] if isinstance(meshes, str | Path | MeshRef) else list(meshes)
-    refs = [mesh if isinstance(mesh, MeshRef) else MeshRef(Path(mesh)) for mesh in several]
-    if not refs:
-        raise MeshError("there is no mesh to ingest: name at least one file")
-    missing = [str(ref.path) for ref in refs if not ref.path.exists()]
-    if missing:
-        raise MeshError(f"{', '.join(missing)}: no such file; check the path")
-    return refs
 
 
 def _moved(vertices: NDArray[np.floating], matrix: Float64Array) -> Float64Array:

@@ -12,6 +12,8 @@ from penumbra.errors import SceneError
 MAX_SETS = 256
 MAX_SAMPLES = 1 << 16
 MAX_SEED = 2**63 - 1
+# Sixteen roundings of subnormal numbers.
+_SUBNORMAL_ROUNDING = 16 * 5e-324
 _U64 = np.uint64
 
 
@@ -66,13 +68,15 @@ class RectLight:
     @cached_property
     def area(self) -> float:
         """Area of the parallelogram, in squared scene units."""
-        return float(np.linalg.norm(np.cross(self.edge_u, self.edge_v)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _length(np.cross(self.edge_u, self.edge_v))
 
     @cached_property
     def emission_normal(self) -> Float64Array:
         """Unit float64 (3,) along cross(edge_u, edge_v); zeros for a light of zero area."""
-        normal = np.cross(self.edge_u, self.edge_v)
-        return normal / self.area if self.area > 0 else np.zeros(3)
+        with np.errstate(over="ignore", invalid="ignore"):
+            normal = np.cross(self.edge_u, self.edge_v)
+            return normal / self.area if self.area > 0 else np.zeros(3)
 
     @cached_property
     def sample_points(self) -> Float64Array:
@@ -108,9 +112,10 @@ class RectLight:
             corners=np.concatenate(
                 [self._corners(low.min(0)[None], high.max(0)[None]), self._corners(low, high)]
             ),
+            n_samples=self.samples,
             full_groups=_full_groups(self.samples, group_size),
             # Six roundings at most make a sample point, and as many the origin it is compared with.
-            residual=16.0 * 2.0**-53 * float(reach),
+            residual=16.0 * 2.0**-53 * float(reach) + _SUBNORMAL_ROUNDING,
         )
 
     def _corners(self, low: Float64Array, high: Float64Array) -> Float64Array:
@@ -151,7 +156,9 @@ def _whole_number(value: object, what: str, low: int, high: int) -> int:
 
 
 def _length(edge: Float64Array) -> float:
-    return float(np.linalg.norm(edge))
+    # Scaled first: squares of edges beyond 1e154 would overflow.
+    largest = float(np.abs(edge).max())
+    return largest * float(np.linalg.norm(edge / largest)) if largest > 0 else 0.0
 
 
 def _strata(n_samples: int, length_u: float, length_v: float) -> tuple[Float64Array, Float64Array]:

@@ -12,15 +12,15 @@ from penumbra.memory import format_bytes
 BlockerSource = Literal["store", "memory", "temporary store"]
 
 # Bytes by the thing that is held; each was measured as the growth of VmHWM and rounded up.
-_GBUFFER_BYTES = 72  # a pixel's place in the G-buffer: pixel, point, normal, own triangle, depth
-_VISIBLE_BYTES = 112  # a pixel while visible points are found: z-buffer, ids, the batches of the G-buffer
-_CAST_BYTES = 144  # a receiver while it is cast: light space copy, hierarchy, order, facing state
-_SHADE_BYTES = 24  # a receiver while it is shaded and put on the film
-_MASK_WORD_BYTES = 8
+_GBUFFER_BYTES = 72  # a pixel of a pass: its pixel, point, normal, triangle and depth
+_VISIBLE_BYTES = 112  # a pixel while visible points are found, its place in the G-buffer included
+_CAST_BYTES = 112  # a receiver while it is cast and shaded: place in its tile, hierarchy, facing, results
+_MASK_WORD_BYTES = 16  # 64 light samples of a receiver: in the result, and at worst in its tile's pool too
 _PREVIEW_BYTES = 24  # a pixel while the picture is exposed
 _ENCODE_BYTES = 24 << 20  # buffers of the EXR encoder
 _STORE_BYTES = 48 << 20  # two chunks of 64 Ki blockers with boxes and reading buffers, the store's index
-_MEMORY_TRIANGLE_BYTES = 260  # a blocker while it is sorted in memory; 90 stay
+_READ_TRIANGLE_BYTES = 260  # a blocker while it is read and sorted in memory
+_KEPT_TRIANGLE_BYTES = 112  # a blocker in memory after that
 _KERNEL_BYTES = 96 << 20  # machine code and LLVM's own memory once every kernel is loaded
 _INGEST_LEAST_BYTES = 96 << 20
 _SCRATCH_TRIANGLE_BYTES = 2 * 84  # the store and, while it is made, its unsorted buckets
@@ -59,16 +59,17 @@ class RenderPlan:
     resident_bytes: int
     kernel_bytes: int
     film_bytes: int
+    ingest_bytes: int
     blocker_bytes: int
     pass_bytes: int
+    write_bytes: int
     scratch_bytes: int
 
     @property
     def needed_bytes(self) -> int:
         """Most resident memory that the process is planned to take."""
-        return (
-            self.resident_bytes + self.kernel_bytes + self.film_bytes + self.blocker_bytes + self.pass_bytes
-        )
+        always = self.resident_bytes + self.kernel_bytes + self.film_bytes
+        return always + max(self.ingest_bytes, self.blocker_bytes + self.pass_bytes, self.write_bytes)
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -94,19 +95,19 @@ class RenderPlan:
         x0, y0, x1, y1 = self.window
         rows = max((y1 - y0 for _, y0, _, y1 in self.passes), default=0)
         about = "" if self.geometry.is_exact else "at most about "
-        parts = (
-            ("process", self.resident_bytes),
-            ("kernels", self.kernel_bytes),
-            ("film", self.film_bytes),
-            ("blockers", self.blocker_bytes),
-            ("one pass", self.pass_bytes),
+        always = (("process", self.resident_bytes), ("kernels", self.kernel_bytes), ("film", self.film_bytes))
+        stages = (
+            ("to ingest", self.ingest_bytes),
+            ("to cast", self.blocker_bytes + self.pass_bytes),
+            ("to write", self.write_bytes),
         )
         lines = [
             ("picture", f"{width} x {height}, window {x0} {y0} {x1} {y1}: {(x1 - x0) * (y1 - y0):,} pixels"),
             *(("light", f"{name}: {samples} samples in {sets} sets") for name, samples, sets in self.lights),
             ("blockers", f"{about}{self.geometry.n_triangles:,} triangles from {self.source}"),
             ("passes", f"{len(self.passes)} of up to {rows} rows, {self.threads} threads"),
-            ("memory", " + ".join(f"{name} {format_bytes(size)}" for name, size in parts)),
+            ("memory", " + ".join(f"{name} {format_bytes(size)}" for name, size in always)),
+            ("", "and, in turn, " + ", ".join(f"{format_bytes(size)} {name}" for name, size in stages)),
             ("needed", f"{format_bytes(self.needed_bytes)} of {format_bytes(self.limit_bytes)}"),
             ("scratch", f"{format_bytes(self.scratch_bytes)} of disk" if self.scratch_bytes else "none"),
         ]
@@ -131,15 +132,12 @@ def make_plan(
     free = limit_bytes - resident_bytes - _KERNEL_BYTES - film
     n_words = max(-(-light.samples // 64) for light in lights)
     row_bytes = (window[2] - window[0]) * _pixel_bytes(n_words)
-    # The picture is exposed and encoded when no pass is in memory, but both come out of the same limit.
-    after_bytes = _ENCODE_BYTES + (window[2] - window[0]) * (window[3] - window[1]) * _PREVIEW_BYTES
-    least_pass_bytes = max(row_bytes, after_bytes)
-    source, blocker_bytes = _place_blockers(geometry, free, least_pass_bytes)
-    rows = (free - blocker_bytes) // row_bytes
-    if free < blocker_bytes + least_pass_bytes:
-        least = limit_bytes - free + blocker_bytes + least_pass_bytes
-        raise MemoryLimitError(_refusal(resolution, window, n_words, limit_bytes, least))
-    passes = _bands(window, rows)
+    write_bytes = _ENCODE_BYTES + (window[2] - window[0]) * (window[3] - window[1]) * _PREVIEW_BYTES
+    source, ingest_bytes, blocker_bytes = _place_blockers(geometry, free, row_bytes)
+    least = max(ingest_bytes, blocker_bytes + row_bytes, write_bytes)
+    if free < least:
+        raise MemoryLimitError(_refusal(resolution, window, n_words, limit_bytes, limit_bytes - free + least))
+    passes = _bands(window, (free - blocker_bytes) // row_bytes)
     return RenderPlan(
         resolution=resolution,
         window=window,
@@ -152,27 +150,29 @@ def make_plan(
         resident_bytes=resident_bytes,
         kernel_bytes=_KERNEL_BYTES,
         film_bytes=film,
+        ingest_bytes=ingest_bytes,
         blocker_bytes=blocker_bytes,
-        pass_bytes=max(max(y1 - y0 for _, y0, _, y1 in passes) * row_bytes, after_bytes),
+        pass_bytes=max(y1 - y0 for _, y0, _, y1 in passes) * row_bytes,
+        write_bytes=write_bytes,
         scratch_bytes=geometry.n_triangles * _SCRATCH_TRIANGLE_BYTES if source == "temporary store" else 0,
     )
 
 
 def _pixel_bytes(n_words: int) -> int:
     """Memory of one pixel of a pass: finding visible points and casting them follow each other."""
-    casting = n_words * _MASK_WORD_BYTES + max(_CAST_BYTES, _SHADE_BYTES)
-    return _GBUFFER_BYTES + max(_VISIBLE_BYTES, casting)
+    return max(_VISIBLE_BYTES, _GBUFFER_BYTES + _CAST_BYTES + n_words * _MASK_WORD_BYTES)
 
 
-def _place_blockers(geometry: GeometryPlan, free: int, least_pass_bytes: int) -> tuple[BlockerSource, int]:
-    """Where the blockers are read from, and the memory that takes, of `free` bytes for them and a pass."""
+def _place_blockers(geometry: GeometryPlan, free: int, row_bytes: int) -> tuple[BlockerSource, int, int]:
+    """Where the blockers are read from, the memory to get them there, and what they then take of `free`."""
     if geometry.is_store:
-        return "store", _STORE_BYTES
-    # Half of what is free: the other half makes the passes few.
-    in_memory = geometry.n_triangles * _MEMORY_TRIANGLE_BYTES
-    if in_memory <= min(free // 2, free - least_pass_bytes):
-        return "memory", in_memory
-    return "temporary store", max(_STORE_BYTES, _INGEST_LEAST_BYTES)
+        return "store", 0, _STORE_BYTES
+    read_bytes = geometry.n_triangles * _READ_TRIANGLE_BYTES
+    kept_bytes = geometry.n_triangles * _KEPT_TRIANGLE_BYTES
+    # Half of what is free at most: the other half makes the passes few.
+    if read_bytes <= free and kept_bytes <= min(free // 2, free - row_bytes):
+        return "memory", read_bytes, kept_bytes
+    return "temporary store", _INGEST_LEAST_BYTES, _STORE_BYTES
 
 
 def _bands(window: Window, rows: int) -> tuple[Window, ...]:

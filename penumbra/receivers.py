@@ -43,6 +43,7 @@ class ReceiverTile:
         light: LightSamples,
         full: UInt64Array,
         *,
+        blocker_extent: float,
         group_size: int,
         leaf_receivers: int,
         lazy_masks: bool,
@@ -58,7 +59,7 @@ class ReceiverTile:
         self.pool = _new_pool(len(rows), full, _FIRST_MASKS if lazy_masks else len(rows))
         if not lazy_masks:
             self._give_masks(np.arange(len(rows)))
-        self.shaft = _shaft(self._points, light)
+        self.shaft = _shaft(self._points, light, blocker_extent)
 
     def set_masks(self, tile_rows: Int64Array, masks: UInt64Array) -> None:
         """Start some receivers of the tile with bits set: the samples they do not face."""
@@ -174,13 +175,14 @@ def _build(
     )
 
 
-def _shaft(points: Float64Array, light: LightSamples) -> Shaft:
+def _shaft(points: Float64Array, light: LightSamples, blocker_extent: float) -> Shaft:
     corners = light.corners[0]
     margin = 4.0 * light.residual
     tile_box = np.concatenate([points.min(axis=0), points.max(axis=0)])
     light_box = np.concatenate([corners.min(axis=0) - margin, corners.max(axis=0) + margin])
     extent = float(max(np.abs(tile_box).max(), np.abs(light_box).max()))
     box, planes = np.empty(6), np.empty((N_SHAFT_PLANES, 4))
-    fill_shaft(tile_box, light_box, extent, box, planes)
+    # The slack of the planes must cover the rounding of what is tested against them.
+    fill_shaft(tile_box, light_box, max(extent, blocker_extent), box, planes)
     reach = float(np.linalg.norm(box[3:] - box[:3])) * (1 + 1e-9)
     return Shaft(box, planes, extent, reach)

@@ -1,12 +1,12 @@
 """The story of a render, from scene file to OpenEXR image; the calls stand in the order of the stages."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from penumbra.api import backend_named
-from penumbra.arrays import Receivers
+from penumbra.arrays import Receivers, UInt8Array, UInt64Array
 from penumbra.blockers import Blockers
 from penumbra.compile_ahead import compile_ahead
 from penumbra.errors import SceneError
@@ -31,6 +31,7 @@ from penumbra.visible import GBuffer, find_visible
 
 SceneLike = Scene | str | Path
 PathLike = str | Path
+CastReceivers = Callable[..., tuple[UInt64Array, UInt8Array, Stats]]
 
 # A face of an OBJ file with its share of the vertices takes 20 bytes at least, binary formats less.
 _LEAST_TRIANGLE_BYTES = 12
@@ -107,23 +108,43 @@ def render(
     film = Film(*plan.resolution, window, [light.name for light in scene.lights])
     with _open_blockers(scene, plan, outputs.scratch_parent(scratch), run, progress) as blockers:
         for band in plan.passes:
-            seen = _see(scene, blockers, band, plan.threads, run, progress)
-            _put_geometry(film, seen)
-            receivers = Receivers(seen.points, seen.normals, seen.own, seen.pixel)
-            for light in scene.lights:
-                masks, sample_sets, cast_stats = cast_receivers(
-                    receivers, blockers, light, options=CastOptions(), threads=plan.threads, progress=progress
-                )
-                run.merge(cast_stats)
-                with run.timed("shade"):
-                    shading = shade(seen.points, seen.normals, sample_sets, masks, light, plan.threads)
-                    _put_shading(film, light.name, seen, shading)
+            _render_band(scene, blockers, band, cast_receivers, plan.threads, film, run, progress)
     image = _develop(film, scene, settings, plan, run)
     progress.stage("write", None, "")
     with run.timed("write"):
         outputs.write(image, plan.threads)
     outputs.write_numbers(_numbers(image, plan))
     return image
+
+
+def _render_band(
+    scene: Scene,
+    blockers: Blockers,
+    band: Window,
+    cast_receivers: CastReceivers,
+    threads: int,
+    film: Film,
+    run: Stats,
+    progress: Progress,
+) -> None:
+    """Render some rows of the picture: one pass over the blockers to see, and one for each light."""
+    with run.timed("visible"):
+        seen = find_visible(
+            blockers, scene.camera, band, threads=threads, progress=progress, counters=run.counters
+        )
+        run.count("n_receivers", len(seen.pixel))
+        _put_geometry(film, seen)
+    receivers = Receivers(seen.points, seen.normals, seen.own, seen.pixel)
+    for light in scene.lights:
+        masks, sample_sets, cast_stats = cast_receivers(
+            receivers, blockers, light, options=CastOptions(), threads=threads, progress=progress
+        )
+        run.merge(cast_stats)
+        with run.timed("shade"):
+            shading = shade(seen.points, seen.normals, sample_sets, masks, light, threads)
+            # The masks of one light must not be there while the next is cast.
+            del masks
+            _put_shading(film, light.name, seen, shading)
 
 
 def plan_render(
@@ -239,25 +260,17 @@ def _open_blockers(
                 blockers = blockers_in_memory(scene.geometry, progress=progress)
             else:
                 folder = stack.enter_context(temporary_folder(scratch))
-                limit = plan.limit_bytes - plan.resident_bytes
                 blockers = ingest(
-                    scene.geometry, folder / "blockers.h5", memory=limit, scratch=folder, progress=progress
+                    scene.geometry,
+                    folder / "blockers.h5",
+                    memory=plan.limit_bytes - resident_bytes(),
+                    scratch=folder,
+                    progress=progress,
                 )
             stack.callback(blockers.close)
         run.count("n_triangles", blockers.n_triangles)
         run.count("n_dropped", blockers.n_dropped)
         yield blockers
-
-
-def _see(
-    scene: Scene, blockers: Blockers, band: Window, threads: int, run: Stats, progress: Progress
-) -> GBuffer:
-    with run.timed("visible"):
-        seen = find_visible(
-            blockers, scene.camera, band, threads=threads, progress=progress, counters=run.counters
-        )
-    run.count("n_receivers", len(seen.pixel))
-    return seen
 
 
 def _put_geometry(film: Film, seen: GBuffer) -> None:

@@ -1,5 +1,6 @@
 """What every test file may use: seeded random numbers, a small mesh, a small scene file."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -67,3 +68,9 @@ def scene_file(square_obj: Path) -> Path:
     path = square_obj.with_name("square.toml")
     path.write_text(SCENE)
     return path
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say how many decisions the exact judge has taken: the suite is to stay below 200,000."""
+    if "oracle" in sys.modules:
+        terminalreporter.write_line(f"exact judge: {sys.modules['oracle'].Count.predicates:,} predicates")

@@ -1,4 +1,4 @@
-"""What Embree says of segments: run as a process of its own, because Embree sets flush-to-zero in its threads.
+"""What Embree says of segments. A process of its own, because Embree sets flush-to-zero in its threads.
 
     python embree_child.py INPUT.npz OUTPUT.npy
 

@@ -57,3 +57,14 @@ def test_lights_that_are_not_finite_are_refused(change: dict[str, Any]) -> None:
     good: dict[str, Any] = {"corner": (0, 0, 1), "edge_u": (1, 0, 0), "edge_v": (0, 1, 0), "name": "lamp"}
     with pytest.raises(SceneError, match=f"{next(iter(change))} of light 'lamp'"):
         RectLight(**good | change)
+
+
+@pytest.mark.parametrize("exponent", [-320, -160, 140, 160, 300])
+def test_lights_of_any_size_have_samples_or_are_refused(exponent: int) -> None:
+    edge = float(f"1e{exponent}")
+    try:
+        samples = RectLight((0, 0, 0), (edge, 0, 0), (0, edge, 0), samples=16).sample_points
+    except SceneError:
+        return
+    assert (samples[..., :2] >= 0.0).all()
+    assert (samples[..., :2] <= edge).all()

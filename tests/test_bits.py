@@ -45,8 +45,27 @@ SCALES_AND_OFFSETS = [
     (1e-6, 1e4),
     (2.0**-20, 1e6),
     (1e6, 1e6),
-    (1e-150, 0.0),
-    (1e100, 0.0),
+]
+# Where products of coordinates underflow, are subnormal, or overflow, in one kernel or another.
+EXTREME_EXPONENTS = (-320, -300, -200, -160, -150, -108, -106, -104, 100, 103, 104, 150)
+
+# Point light, receiver and one corner after the other of a blocker whose far corners lie, but for
+# rounding, in a plane through the segment: no bound may be sized by receivers and light alone.
+FAR_CORNERS = [
+    (
+        [0.13252034159363424, -0.5955890583153038, 4.756192491285759],
+        [1.5112753151793488, 0.7823717377791959, -0.41361996208610563],
+        [117274.22872907741, 117205.94949616691, -919818.7011922685],
+        [-769946.6658448743, -769503.896430487, 6039007.99190538],
+        [97645467.2954774, -37557985.41178756, 136163241.1395675],
+    ),
+    (
+        [-0.8222703570661389, 0.47904230870344056, 3.0303501671759494],
+        [1.6653659859998755, -1.9320030881652008, -1.3387972108189201],
+        [-3568.198095264482, 3458.0202080494437, 18198.54377646949],
+        [19061.83526336871, -18475.265142279775, -97209.79782550117],
+        [-92635.98537054495, -7682.58705702506, -14601.127976835016],
+    ),
 ]
 
 OPTIONS = {
@@ -110,8 +129,36 @@ def test_padding_bits_are_zero_in_full_shadow(backend: str, samples: int) -> Non
 @pytest.mark.parametrize("family", ["soup", "shared_edges", "on_blockers", "corners_on_segments"])
 def test_scales_and_offsets(backend: str, family: str, scale: float, offset: float) -> None:
     for light in ("square above", "skewed"):
-        scene = scene_of(family, light_named(light, 24))
+        scene = scene_of(family, light_named(light, 12))
         assert_every_bit(transformed(scene, scale, offset), backend)
+
+
+@pytest.mark.parametrize("exponent", EXTREME_EXPONENTS)
+def test_extreme_scales(backend: str, exponent: int) -> None:
+    for family in ("soup", "shared_edges", "on_blockers", "corners_on_segments"):
+        scene = scene_of(family, light_named("square above", 12), seed=1)
+        assert_every_bit(transformed(scene, float(f"1e{exponent}"), 0.0), backend)
+
+
+@pytest.mark.parametrize("exponent", [-323, -320, -315, -305, -200, 200, 300, 307, 308])
+def test_normals_of_any_length(backend: str, exponent: int, rng: np.random.Generator) -> None:
+    light = light_named("square above, two-sided", 20)
+    points = receivers_below(rng, 30)
+    towards = rng.choice(light.sample_points[0], 30) - points
+    across = np.cross(towards, rng.normal(0, 1, (30, 3)))
+    normals = np.concatenate([across[:15], rng.normal(0, 1, (15, 3))])
+    normals = normals / np.abs(normals).max(axis=1, keepdims=True) * float(f"1e{exponent}")
+    normals[~normals.any(axis=1)] = [5e-324, 0.0, 0.0]
+    assert_every_bit(SmallScene(points, np.zeros((0, 3, 3)), light, normals), backend)
+
+
+@pytest.mark.parametrize("roll", [0, 1, 2])
+@pytest.mark.parametrize("case", FAR_CORNERS)
+def test_blockers_with_corners_far_away(backend: str, case: tuple[list[float], ...], roll: int) -> None:
+    corner, point, *blocker = np.roll(np.array(case), roll, axis=1)
+    light = RectLight(corner, (0, 0, 0), (0, 0, 0), samples=1, two_sided=True)
+    scene = SmallScene(point[None], np.array(blocker)[None], light)
+    assert assert_every_bit(scene, backend).tolist() == [[1]]
 
 
 @pytest.mark.parametrize("name", OPTIONS)

@@ -3,9 +3,12 @@
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import click
+import numpy as np
 import pytest
+import trimesh
 
 from penumbra.cli.main import cli
 from penumbra.io.scene_file import TABLE_KEYS
@@ -62,6 +65,29 @@ def test_links_lead_somewhere(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_no_page_speaks_of_one_machine(page: Path) -> None:
     assert not _MACHINE_PATH.search(page.read_text())
+
+
+def test_the_example_of_the_readme_does_what_it_says() -> None:
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(block, names)
+    # By similar triangles the second point sees the half of the light that is past its middle.
+    np.testing.assert_allclose(names["result"].visibility, [0, 0.5, 1], atol=1 / 16)
+    assert names["result"].masks.shape == (3, 1)
+
+
+def test_the_examples_for_python_run(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = scene_file.parent
+    monkeypatch.chdir(folder)
+    (folder / "scene.toml").write_bytes(scene_file.read_bytes())
+    for name in ("terrain.ply", "trees.obj", "scene.ply"):
+        kind = Path(name).suffix[1:]
+        trimesh.load(folder / "square.obj", process=False).export(folder / name, file_type=kind)
+    names: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL):
+        exec(block.replace("(640, 480)", "(64, 48)"), names)
+    assert names["visibility"].dtype == np.float32 and names["visibility"].shape == (48, 64)
+    assert names["seen"].shape[1] == 3
 
 
 def test_two_commands_are_enough() -> None:

@@ -205,7 +205,7 @@ def test_where_the_blockers_come_from_changes_nothing(scene_path, tmp_path, monk
     assert plan_render(store_scene).source == "store"
     assert_same_layers(penumbra.render(store_scene).layers, in_memory.layers)
 
-    monkeypatch.setattr(plan_module, "_MEMORY_TRIANGLE_BYTES", 1 << 40)
+    monkeypatch.setattr(plan_module, "_READ_TRIANGLE_BYTES", 1 << 40)
     assert plan_render(scene_path).source == "temporary store"
     scratch = tmp_path / "scratch"
     scratch.mkdir()
@@ -328,7 +328,7 @@ def test_failing_leaves_nothing_behind(scene_path, tmp_path, monkeypatch):
     def stop(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(plan_module, "_MEMORY_TRIANGLE_BYTES", 1 << 40)
+    monkeypatch.setattr(plan_module, "_READ_TRIANGLE_BYTES", 1 << 40)
     monkeypatch.setattr("penumbra.film.Film.add_direct_light", stop)
     with pytest.raises(KeyboardInterrupt):
         penumbra.render(scene_path, tmp_path / "out.exr", preview=tmp_path / "out.png")

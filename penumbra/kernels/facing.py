@@ -3,7 +3,13 @@
 import numpy as np
 
 from penumbra.kernels._jit import helper, kernel
-from penumbra.kernels.predicates import UNIT_ROUNDOFF, dot_difference_sign, edges_side_sign
+from penumbra.kernels.predicates import (
+    OVERFLOW,
+    UNDERFLOW,
+    UNIT_ROUNDOFF,
+    dot_difference_sign,
+    edges_side_sign,
+)
 
 FACES_ALL = np.uint8(0)
 FACES_SOME = np.uint8(1)
@@ -23,7 +29,10 @@ def _normal_faces(px, py, pz, nx, ny, nz, light):
         highest = max(highest, side)
         reach = max(reach, abs(dx) + abs(dy) + abs(dz))
     # The samples lie within `residual` of the polygon of the corners; both are rounded points.
-    bound = (abs(nx) + abs(ny) + abs(nz)) * (16.0 * UNIT_ROUNDOFF * reach + 2.0 * light.residual)
+    norm = abs(nx) + abs(ny) + abs(nz)
+    if not norm * reach < OVERFLOW:
+        return FACES_SOME
+    bound = norm * (16.0 * UNIT_ROUNDOFF * reach + 2.0 * light.residual) + UNDERFLOW * (1.0 + norm + reach)
     if lowest > bound:
         return FACES_ALL
     return FACES_NONE if highest < -bound else FACES_SOME

@@ -16,6 +16,7 @@ from penumbra.kernels.lanes import bits_above, bits_not_below, lesser, load, spl
 from penumbra.kernels.penumbra_volume import cross
 from penumbra.kernels.predicates import (
     DET_BOUND,
+    OVERFLOW,
     UNDECIDED,
     UNDERFLOW,
     UNIT_ROUNDOFF,
@@ -74,7 +75,9 @@ def light_side(tri, normal, light, extent):
         lowest = min(lowest, height)
         highest = max(highest, height)
     permanent = normal[3] + normal[4] + normal[5]
-    bound = permanent * (32.0 * UNIT_ROUNDOFF * extent + 4.0 * light.residual) + UNDERFLOW
+    if not permanent * extent < OVERFLOW:
+        return np.int64(0)
+    bound = permanent * (32.0 * UNIT_ROUNDOFF * extent + 4.0 * light.residual) + UNDERFLOW * (1.0 + extent)
     if lowest > bound:
         return np.int64(1)
     return np.int64(-1) if highest < -bound else np.int64(0)
@@ -84,7 +87,9 @@ def light_side(tri, normal, light, extent):
 def _set_edge(k, a, b, c, error, edges):
     """Store one function scaled to at most 1, with the bound of its lanes."""
     largest = max(max(abs(a), abs(b)), abs(c))
-    if not (largest > _SMALLEST and largest < _LARGEST):
+    # The sum is not finite where any of the three is not; a maximum may pass over a nan.
+    total = abs(a) + abs(b) + abs(c)
+    if not (total > _SMALLEST and total < _LARGEST and error < _LARGEST):
         # Nothing is known: every lane is left open.
         edges[k, 0] = edges[k, 1] = edges[k, 2] = np.float32(0.0)
         edges[k, 3] = np.float32(np.inf)
@@ -106,7 +111,9 @@ def fill_edges(blocker, normal, side, x, y, z, light, light_norm, edges):
     tri = blocker.corners
     u, v, o = light.edge_u, light.edge_v, light.origin
     gx, gy, gz = o[0] - x, o[1] - y, o[2] - z
-    reach = _COEFFICIENT_BOUND * (abs(gx) + abs(gy) + abs(gz) + light_norm) + light.residual
+    length = abs(gx) + abs(gy) + abs(gz) + light_norm
+    reach = _COEFFICIENT_BOUND * length + light.residual
+    tiny = UNDERFLOW * (1.0 + length)
     flip = -float(side)
     for k in range(3):
         i = k + 1 if k < 2 else 0
@@ -120,19 +127,20 @@ def fill_edges(blocker, normal, side, x, y, z, light, light_norm, edges):
             nx * gx + ny * gy + nz * gz,
             nx * u[0] + ny * u[1] + nz * u[2],
             nx * v[0] + ny * v[1] + nz * v[2],
-            size * reach,
+            size * reach + tiny,
             edges,
         )
     if blocker.side == 0:
         nx, ny, nz = normal[0] * flip, normal[1] * flip, normal[2] * flip
         hx, hy, hz = o[0] - tri[0, 0], o[1] - tri[0, 1], o[2] - tri[0, 2]
-        reach = _COEFFICIENT_BOUND * (abs(hx) + abs(hy) + abs(hz) + light_norm) + light.residual
+        length = abs(hx) + abs(hy) + abs(hz) + light_norm
+        reach = _COEFFICIENT_BOUND * length + light.residual
         _set_edge(
             3,
             nx * hx + ny * hy + nz * hz,
             nx * u[0] + ny * u[1] + nz * u[2],
             nx * v[0] + ny * v[1] + nz * v[2],
-            (normal[3] + normal[4] + normal[5]) * reach,
+            (normal[3] + normal[4] + normal[5]) * reach + UNDERFLOW * (1.0 + length),
             edges,
         )
     else:

@@ -177,7 +177,8 @@ def fill_unit_boxes(vertices, bounds, out_boxes):
 @helper
 def _sort_digit(digits, order, shift, counts, out_order):
     """One pass of a radix sort: stable, by _DIGIT_BITS bits of digits[t] from `shift` on."""
-    counts[:] = 0
+    for digit in range(len(counts)):
+        counts[digit] = 0
     for t in order:
         counts[(digits[t] >> shift) & _DIGIT_MASK] += 1
     total = 0
@@ -200,7 +201,9 @@ def fill_axis_orders(boxes, out_orders):
     n_boxes = len(boxes)
     digits = np.empty(n_boxes, np.int32)
     counts = np.empty(1 << _DIGIT_BITS, np.int32)
-    first_order = np.arange(n_boxes).astype(np.int32)
+    first_order = np.empty(n_boxes, np.int32)
+    for t in range(n_boxes):
+        first_order[t] = t
     spare = np.empty(n_boxes, np.int32)
     largest = np.float32((1 << 2 * _DIGIT_BITS) - 1)
     for axis in range(3):

@@ -16,7 +16,7 @@ import numpy as np
 
 from penumbra.kernels._jit import helper, inlined
 from penumbra.kernels.lanes import bits_above, bits_not_below, greater, lesser, load, splat
-from penumbra.kernels.predicates import UNIT_ROUNDOFF
+from penumbra.kernels.predicates import OVERFLOW, UNDERFLOW, UNIT_ROUNDOFF
 
 N_PLANES = 8
 VOLUME_SIZE = 4 * N_PLANES
@@ -48,7 +48,8 @@ def light_gap(tri, light):
     u, v, o = light.edge_u, light.edge_v, light.origin
     nx, ny, nz = cross(u[0], u[1], u[2], v[0], v[1], v[2])
     length = np.sqrt(nx * nx + ny * ny + nz * nz)
-    if length > 0.0:
+    # Beyond these bounds the squares lose bits or overflow, and the gap along the normal is left out.
+    if length > 1e-120 and length < 1e120:
         low = np.inf
         high = -np.inf
         for k in range(3):
@@ -60,14 +61,14 @@ def light_gap(tri, light):
     reach = abs(o[0]) + abs(o[1]) + abs(o[2])
     for k in range(3):
         reach += abs(tri[k, 0]) + abs(tri[k, 1]) + abs(tri[k, 2])
-    return gap * (1.0 - 1e-9) - 1e-13 * reach - 4.0 * light.residual
+    return gap * (1.0 - 1e-9) - 1e-13 * reach - 4.0 * light.residual - UNDERFLOW
 
 
 @helper
 def _place_plane(nx, ny, nz, tri, corners, polygon, extent, amplify, residual, planes, k):
     """Put the bound along direction n at place k; False where the direction does not separate."""
     norm = abs(nx) + abs(ny) + abs(nz)
-    if not norm > 0.0:
+    if not (norm > 0.0 and norm * extent < OVERFLOW):
         return False
     inside = np.inf
     for q in range(3):
@@ -78,7 +79,7 @@ def _place_plane(nx, ny, nz, tri, corners, polygon, extent, amplify, residual, p
             light_side,
             nx * corners[polygon, j, 0] + ny * corners[polygon, j, 1] + nz * corners[polygon, j, 2],
         )
-    tolerance = norm * (TOLERANCE * extent + 2.0 * residual)
+    tolerance = norm * (TOLERANCE * extent + 2.0 * residual) + UNDERFLOW
     overlap = light_side - inside
     if not overlap <= tolerance:
         return False

@@ -16,6 +16,8 @@ DET_BOUND = 8.0 * UNIT_ROUNDOFF
 DOT_BOUND = 6.0 * UNIT_ROUNDOFF
 # An underflowing product is off by at most 2**-1074; three more factors of slack cover the sums.
 UNDERFLOW = 1e-300
+# Sums of products below this cannot have overflowed on the way.
+OVERFLOW = 1e300
 UNDECIDED = np.int64(2)
 
 

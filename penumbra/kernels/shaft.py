@@ -7,7 +7,7 @@ any rounding of a direction is harmless.
 import numpy as np
 
 from penumbra.kernels._jit import helper, kernel
-from penumbra.kernels.predicates import UNIT_ROUNDOFF
+from penumbra.kernels.predicates import OVERFLOW, UNDERFLOW, UNIT_ROUNDOFF
 
 N_SHAFT_PLANES = 12
 
@@ -18,7 +18,7 @@ def fill_shaft(tile_box, light_box, extent, box, planes):
 
     For each pair of axes and each of four corners of the two rectangles seen along the third axis,
     the line from one corner to the other bounds the hull if it is tangent; if it is not, its bound is
-    only loose.
+    only loose. extent: largest coordinate of the two boxes and of every box that will be tested.
     """
     for k in range(3):
         box[k] = min(tile_box[k], light_box[k])
@@ -44,10 +44,12 @@ def fill_shaft(tile_box, light_box, extent, box, planes):
                     high,
                     max(ni * other[i], ni * other[3 + i]) + max(nj * other[j], nj * other[3 + j]),
                 )
-            planes[n, 0] = planes[n, 1] = planes[n, 2] = 0.0
-            planes[n, i] = ni
-            planes[n, j] = nj
-            planes[n, 3] = high + 16.0 * UNIT_ROUNDOFF * (abs(ni) + abs(nj)) * extent
+            norm = abs(ni) + abs(nj)
+            planes[n, :] = 0.0
+            if norm * extent < OVERFLOW:
+                planes[n, i] = ni
+                planes[n, j] = nj
+                planes[n, 3] = high + 16.0 * UNIT_ROUNDOFF * norm * extent + UNDERFLOW
             n += 1
 
 
