@@ -82,17 +82,16 @@ def write_demo_scene(folder: Path) -> Path:
 
 def demo_triangles() -> Float64Array:
     """All triangles of the scene, float64 (T, 3, 3), world space, metres; the same at every call."""
-    rng = np.random.default_rng(7)
     parts = [
-        *_floor(rng),
+        *_floor(np.random.default_rng(1)),
         _box((_WALL_X - 0.4, -0.1, _END_Z - 0.4), (_WALL_X, _TOP_Y + 0.5, _FRONT_Z)),
         _box((_WALL_X, -0.1, _END_Z - 0.4), (_ARCADE_X + 0.6, _TOP_Y + 0.5, _END_Z)),
         _box((_ARCADE_X - 0.34, _TOP_Y, _END_Z), (_ARCADE_X + 0.34, _TOP_Y + 0.24, _FRONT_Z)),
         *(_column(z) for z in _COLUMN_Z),
         *(_arch(z - _SPAN / 2) for z in (_COLUMN_Z[0] + _SPAN, *_COLUMN_Z[:-1])),
         *_lattice(_COLUMN_Z[1] - _SPAN / 2),
-        *(radius * _unit_sphere(6 if radius > 0.45 else 5) + centre for centre, radius in _SPHERES),
-        *_tree(rng, np.array([3.7, 0.0, 2.0])),
+        *(radius * _unit_sphere(5) + centre for centre, radius in _SPHERES),
+        *_tree(np.random.default_rng(4), np.array([3.7, 0.0, 2.0])),
     ]
     return np.concatenate(parts)
 
@@ -168,7 +167,7 @@ def _tree(rng: np.random.Generator, root: Float64Array) -> list[Float64Array]:
         end = start + length * direction / np.linalg.norm(direction)
         parts.append(_bar(start, end, 2 * radius, sides=7))
         if forks <= 2:
-            parts += [_leaf(start + (end - start) * t, rng) for t in rng.uniform(0.2, 1.0, 6)]
+            parts += [_leaf(start + (end - start) * t, rng) for t in rng.uniform(0.2, 1.0, 4)]
         if forks:
             for _ in range(3):
                 turned = direction / np.linalg.norm(direction) + rng.normal(0, 0.5, 3) + (0, 0.05, 0)

@@ -60,7 +60,7 @@ class CastOptions:
     lazy_masks: bool = True
     """D: allocate masks on demand and release them in full umbra."""
     sort: bool = True
-    """Cast the buckets from large triangles to small; False takes them in stored order reversed."""
+    """Cast from large triangles to small; False: from small to large, to measure what the order gains."""
     group_size: int = 32
     """Light samples in one light sample group, 32 or 64."""
     tile_receivers: int = 8192

@@ -122,11 +122,13 @@ def make_plan(
     limit_bytes: int,
     resident_bytes: int,
     threads: int,
+    process_limit: bool = True,
 ) -> RenderPlan:
     """Choose where the blockers live and how many passes there are.
 
     `limit_bytes` is of the whole process, of which `resident_bytes` are taken before the render begins.
-    Raises MemoryLimitError when not even one row of pixels fits; the message has a limit that would do.
+    Raises MemoryLimitError when not even one row of pixels fits; the message has a limit that would do:
+    of the process when `process_limit`, else of what is added to `resident_bytes`.
     """
     film = film_bytes(window, len(lights))
     free = limit_bytes - resident_bytes - _KERNEL_BYTES - film
@@ -136,7 +138,9 @@ def make_plan(
     source, ingest_bytes, blocker_bytes = _place_blockers(geometry, free, row_bytes)
     least = max(ingest_bytes, blocker_bytes + row_bytes, write_bytes)
     if free < least:
-        raise MemoryLimitError(_refusal(resolution, window, n_words, limit_bytes, limit_bytes - free + least))
+        before = 0 if process_limit else resident_bytes
+        enough = limit_bytes - free + least - before
+        raise MemoryLimitError(_refusal(resolution, window, n_words, limit_bytes - before, enough))
     passes = _bands(window, (free - blocker_bytes) // row_bytes)
     return RenderPlan(
         resolution=resolution,

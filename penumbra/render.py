@@ -140,6 +140,7 @@ def _render_band(
             receivers, blockers, light, options=CastOptions(), threads=threads, progress=progress
         )
         run.merge(cast_stats)
+        run.backend = cast_stats.backend
         with run.timed("shade"):
             shading = shade(seen.points, seen.normals, sample_sets, masks, light, threads)
             # The masks of one light must not be there while the next is cast.
@@ -221,15 +222,19 @@ def _checked_outputs(
 def _make_plan(
     scene: Scene, window: Window, memory: int | str | None, process_limit: bool, threads: int
 ) -> RenderPlan:
-    resident = resident_bytes()
+    asked, resident = parse_size(memory), resident_bytes()
+    # None asks for a part of what is free now, which is never a limit of the whole process.
+    process_limit = process_limit and asked is not None
+    added = call_limit_bytes(asked, process_limit)
     return make_plan(
         scene.camera.resolution,
         window,
         [LightPlan(light.name, light.samples, light.sets) for light in scene.lights],
         _measure_geometry(scene),
-        limit_bytes=resident + call_limit_bytes(parse_size(memory), process_limit),
+        limit_bytes=asked if asked is not None and process_limit else resident + added,
         resident_bytes=resident,
         threads=resolve_threads(threads),
+        process_limit=process_limit,
     )
 
 

@@ -156,10 +156,15 @@ class Scene:
 
 def check_resolution(resolution: Sequence[int]) -> tuple[int, int]:
     """Width and height as positive ints, or `SceneError`."""
-    values = tuple(resolution)
-    if len(values) != 2 or not all(isinstance(v, int | np.integer) and v > 0 for v in values):
-        raise SceneError(f"camera.resolution is {list(values)}: it must be two whole numbers above 0")
-    return int(values[0]), int(values[1])
+    try:
+        width, height = resolution
+        if not all(isinstance(size, int | np.integer) and size > 0 for size in (width, height)):
+            raise ValueError
+    except (TypeError, ValueError):
+        raise SceneError(
+            f"camera.resolution is {resolution!r}: it must be two whole numbers above 0"
+        ) from None
+    return int(width), int(height)
 
 
 def check_light_names(names: Iterable[str]) -> None:
@@ -180,10 +185,13 @@ def check_light_names(names: Iterable[str]) -> None:
 
 
 def _vector(value: Sequence[float], name: str) -> Vector:
-    numbers = np.asarray(value, dtype=np.float64)
-    if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise SceneError(f"{name} is {value}: it must be three finite numbers")
-    return float(numbers[0]), float(numbers[1]), float(numbers[2])
+    try:
+        x, y, z = (float(number) for number in value)
+        if not all(map(math.isfinite, (x, y, z))):
+            raise ValueError
+    except (TypeError, ValueError):
+        raise SceneError(f"{name} is {value!r}: it must be three finite numbers") from None
+    return x, y, z
 
 
 def _affine(value: Float64Array, path: Path) -> Float64Array:

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -297,6 +298,14 @@ def test_what_cannot_be_done_is_refused_before_any_work(scene_path, tmp_path, ch
         with pytest.raises(error, match=words):
             function(scene_path, tmp_path / "out.exr", **change)
     assert os.listdir(tmp_path) == ["scene"]
+
+
+def test_the_limit_named_by_a_refusal_does(scene_path):
+    with pytest.raises(MemoryLimitError) as refusal:
+        penumbra.render(scene_path, memory="8MiB")
+    assert "limit of 8.0 MiB" in str(refusal.value)
+    enough = re.search(r"give (\d+MiB) or more", str(refusal.value)).group(1)
+    assert plan_render(scene_path, memory=enough).passes
 
 
 def test_an_input_is_never_an_output(scene_path, tmp_path):

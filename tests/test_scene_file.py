@@ -1,6 +1,7 @@
 """Scene files: what they say, and one sentence with file, line and key for what is wrong in them."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -162,6 +163,24 @@ def test_python_scenes_are_checked_too(square_obj: Path) -> None:
         Scene((MeshRef(square_obj),), camera, ())
     with pytest.raises(SceneError, match="two lights"):
         Scene((MeshRef(square_obj),), camera, (light, light))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"eye": "abc"},
+        {"eye": (0, 1)},
+        {"look_at": 7},
+        {"up": (0, float("inf"), 0)},
+        {"vfov": float("nan")},
+        {"resolution": 640},
+        {"resolution": (640, 480, 3)},
+        {"resolution": (640.0, 480)},
+    ],
+)
+def test_python_cameras_are_checked_too(wrong: dict[str, Any]) -> None:
+    with pytest.raises(SceneError, match=next(iter(wrong))):
+        Camera(**{"eye": (0, 3, 5), "look_at": (0, 0, 0), **wrong})
 
 
 finite = st.floats(-100, 100, allow_subnormal=False)

@@ -8,7 +8,7 @@ index is seen; in float64 alone they would be mixed pixel by pixel.
 import numpy as np
 
 from penumbra.kernels._jit import helper
-from penumbra.kernels.exact import _accumulate, _fill_row, _multiply, _row_range, _sign
+from penumbra.kernels.exact import ADD, SUBTRACT, accumulate, fill_row, integer_sign, multiply, row_range
 from penumbra.kernels.predicates import DET_BOUND, UNDECIDED, UNDERFLOW, UNIT_ROUNDOFF, sign_of
 from penumbra.kernels.vec3 import absolute, cross, cross_permanent, dot, minus, side_of
 
@@ -76,9 +76,9 @@ def _fill_cross(u, v, pair, out):
     for k in range(3):
         i = (k + 1) % 3
         j = (k + 2) % 3
-        _multiply(u[i], v[j], out[k])
-        _multiply(u[j], v[i], pair)
-        _accumulate(out[k], pair, True)
+        multiply(u[i], v[j], out[k])
+        multiply(u[j], v[i], pair)
+        accumulate(out[k], pair, SUBTRACT)
 
 
 @helper
@@ -86,8 +86,8 @@ def _fill_dot(u, v, pair, out):
     """Set the number out to the dot product of two vectors of numbers."""
     out[:] = np.uint64(0)
     for k in range(3):
-        _multiply(u[k], v[k], pair)
-        _accumulate(out, pair, False)
+        multiply(u[k], v[k], pair)
+        accumulate(out, pair, ADD)
 
 
 @helper
@@ -101,7 +101,7 @@ def _integer_rows(new, old, eye, q):
         minus[row, 0], minus[row, 1], minus[row, 2] = starts[row]
     lows, highs = np.empty(_N_ROWS, np.int64), np.empty(_N_ROWS, np.int64)
     for row in range(_N_ROWS):
-        low, row_bits = _row_range(plus[row], minus[row])
+        low, row_bits = row_range(plus[row], minus[row])
         lows[row], highs[row] = low, low + row_bits
     # D_new * S_old is compared with D_old * S_new: the first two rows must share a scale, and every
     # other row is in both products.
@@ -112,7 +112,7 @@ def _integer_rows(new, old, eye, q):
         bits += highs[row] - lows[row]
     rows = np.zeros((_N_ROWS, 3, bits // 32 + 1), np.uint64)
     for row in range(_N_ROWS):
-        _fill_row(rows[row], plus[row], minus[row], lows[row])
+        fill_row(rows[row], plus[row], minus[row], lows[row])
     return rows
 
 
@@ -131,10 +131,10 @@ def _order_in_integers(new, old, eye, q):
     _fill_cross(rows[_OLD_AB], rows[_OLD_AC], pair, normal)
     _fill_dot(rows[_OLD], normal, pair, d_old)
     _fill_dot(rows[_RAY], normal, pair, s_old)
-    _multiply(d_new, s_old, total)
-    _multiply(d_old, s_new, pair)
-    _accumulate(total, pair, True)
-    return _sign(total) * _sign(s_new) * _sign(s_old)
+    multiply(d_new, s_old, total)
+    multiply(d_old, s_new, pair)
+    accumulate(total, pair, SUBTRACT)
+    return integer_sign(total) * integer_sign(s_new) * integer_sign(s_old)
 
 
 @helper

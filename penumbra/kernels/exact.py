@@ -21,6 +21,10 @@ _ONE = np.uint64(1)
 _SHIFT = np.uint64(LIMB_BITS)
 _LOW = np.uint64(0xFFFFFFFF)
 _TOP_BIT = np.uint64(0x80000000)
+# What a limb is combined with to be added or, as two's complement, subtracted. Constants of one type:
+# numba would compile a literal flag once for either value.
+ADD = np.uint64(0)
+SUBTRACT = np.uint64(0xFFFFFFFF)
 _NO_EXPONENT = np.int64(1 << 30)
 
 
@@ -66,7 +70,7 @@ def _add_shifted(number, mantissa, shift):
 
 
 @helper
-def _multiply(x, y, out):
+def multiply(x, y, out):
     """Set out to x * y; correct if the product fits the common length of the three numbers."""
     n = out.shape[0]
     out[:] = _ZERO
@@ -81,18 +85,18 @@ def _multiply(x, y, out):
 
 
 @helper
-def _accumulate(total, term, negate):
-    """Add a number to another one, or subtract it."""
-    carry = _ONE if negate else _ZERO
+def accumulate(total, term, how):
+    """Add a number to another one (ADD) or subtract it (SUBTRACT)."""
+    carry = how & _ONE
     for i in range(total.shape[0]):
-        piece = (term[i] ^ _LOW) if negate else term[i]
-        value = total[i] + piece + carry
+        value = total[i] + (term[i] ^ how) + carry
         total[i] = value & _LOW
         carry = value >> _SHIFT
 
 
 @helper
-def _sign(number):
+def integer_sign(number):
+    """Sign of a number: -1, 0 or 1."""
     if number[number.shape[0] - 1] & _TOP_BIT:
         return np.int64(-1)
     for i in range(number.shape[0]):
@@ -102,7 +106,7 @@ def _sign(number):
 
 
 @helper
-def _row_range(plus, minus):
+def row_range(plus, minus):
     """Lowest exponent of a row's six values, and the bits that hold each difference with its sign."""
     low = _NO_EXPONENT
     high = -_NO_EXPONENT
@@ -118,7 +122,7 @@ def _row_range(plus, minus):
 
 
 @helper
-def _fill_row(row, plus, minus, low):
+def fill_row(row, plus, minus, low):
     """Set row (3, n_limbs) to the scaled differences plus - minus."""
     for k in range(3):
         for sign, value in ((1, plus[k]), (-1, minus[k])):
@@ -133,41 +137,41 @@ def exact_det_sign(plus, minus):
     lows = np.empty(3, np.int64)
     bits = np.int64(4)
     for row in range(3):
-        low, row_bits = _row_range(plus[row], minus[row])
+        low, row_bits = row_range(plus[row], minus[row])
         lows[row] = low
         bits += row_bits
     n_limbs = bits // LIMB_BITS + 1
     matrix = np.zeros((3, 3, n_limbs), np.uint64)
     for row in range(3):
-        _fill_row(matrix[row], plus[row], minus[row], lows[row])
+        fill_row(matrix[row], plus[row], minus[row], lows[row])
     pair = np.zeros(n_limbs, np.uint64)
     minor = np.zeros(n_limbs, np.uint64)
     total = np.zeros(n_limbs, np.uint64)
     for k in range(3):
         i = (k + 1) % 3
         j = (k + 2) % 3
-        _multiply(matrix[1, i], matrix[2, j], minor)
-        _multiply(matrix[1, j], matrix[2, i], pair)
-        _accumulate(minor, pair, True)
-        _multiply(matrix[0, k], minor, pair)
-        _accumulate(total, pair, False)
-    return _sign(total)
+        multiply(matrix[1, i], matrix[2, j], minor)
+        multiply(matrix[1, j], matrix[2, i], pair)
+        accumulate(minor, pair, SUBTRACT)
+        multiply(matrix[0, k], minor, pair)
+        accumulate(total, pair, ADD)
+    return integer_sign(total)
 
 
 @helper
 def exact_dot_sign(normal, plus, minus):
     """Sign (-1, 0, 1) of normal . (plus - minus), exactly; three float64 (3,) arrays of finite values."""
     zero = np.zeros(3)
-    normal_low, normal_bits = _row_range(normal, zero)
-    low, row_bits = _row_range(plus, minus)
+    normal_low, normal_bits = row_range(normal, zero)
+    low, row_bits = row_range(plus, minus)
     n_limbs = (normal_bits + row_bits + 4) // LIMB_BITS + 1
     factors = np.zeros((3, n_limbs), np.uint64)
     differences = np.zeros((3, n_limbs), np.uint64)
-    _fill_row(factors, normal, zero, normal_low)
-    _fill_row(differences, plus, minus, low)
+    fill_row(factors, normal, zero, normal_low)
+    fill_row(differences, plus, minus, low)
     term = np.zeros(n_limbs, np.uint64)
     total = np.zeros(n_limbs, np.uint64)
     for k in range(3):
-        _multiply(factors[k], differences[k], term)
-        _accumulate(total, term, False)
-    return _sign(total)
+        multiply(factors[k], differences[k], term)
+        accumulate(total, term, ADD)
+    return integer_sign(total)
