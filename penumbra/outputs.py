@@ -49,8 +49,9 @@ class Outputs:
             )
 
     def scratch_parent(self, scratch: str | Path | None) -> Path:
-        """Folder for temporary files: the one asked for, else beside the image."""
+        """Folder for temporary files: the one asked for, else beside the image. Raises OutputError."""
         if scratch is not None:
+            check_output(Path(scratch) / "blockers.h5")
             return Path(scratch)
         return self.image.resolve().parent if self.image is not None else Path(tempfile.gettempdir())
 

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 from penumbra.errors import MemoryLimitError
 from penumbra.film import Window, film_bytes
 from penumbra.memory import format_bytes
+from penumbra.options import CastOptions
 
 BlockerSource = Literal["store", "memory", "temporary store"]
 
@@ -16,6 +17,7 @@ _GBUFFER_BYTES = 72  # a pixel of a pass: its pixel, point, normal, triangle and
 _VISIBLE_BYTES = 112  # a pixel while visible points are found, its place in the G-buffer included
 _CAST_BYTES = 112  # a receiver while it is cast and shaded: place in its tile, hierarchy, facing, results
 _MASK_WORD_BYTES = 16  # 64 light samples of a receiver: in the result, and at worst in its tile's pool too
+_SAMPLE_BYTES = 64  # a light sample of one set, as point and as lane
 _PREVIEW_BYTES = 24  # a pixel while the picture is exposed
 _ENCODE_BYTES = 24 << 20  # buffers of the EXR encoder
 _STORE_BYTES = 48 << 20  # two chunks of 64 Ki blockers with boxes and reading buffers, the store's index
@@ -93,7 +95,10 @@ class RenderPlan:
     def _lines(self) -> list[tuple[str, str]]:
         width, height = self.resolution
         x0, y0, x1, y1 = self.window
-        rows = max((y1 - y0 for _, y0, _, y1 in self.passes), default=0)
+        rows = max(y1 - y0 for _, y0, _, y1 in self.passes)
+        tile = CastOptions().tile_receivers
+        n_tiles = -(-rows * (x1 - x0) // tile)
+        n_reads = len(self.passes) * (1 + len(self.lights))
         about = "" if self.geometry.is_exact else "at most about "
         always = (("process", self.resident_bytes), ("kernels", self.kernel_bytes), ("film", self.film_bytes))
         stages = (
@@ -105,7 +110,9 @@ class RenderPlan:
             ("picture", f"{width} x {height}, window {x0} {y0} {x1} {y1}: {(x1 - x0) * (y1 - y0):,} pixels"),
             *(("light", f"{name}: {samples} samples in {sets} sets") for name, samples, sets in self.lights),
             ("blockers", f"{about}{self.geometry.n_triangles:,} triangles from {self.source}"),
-            ("passes", f"{len(self.passes)} of up to {rows} rows, {self.threads} threads"),
+            ("", f"read {n_reads} times at most: to see, and for each light, in each pass"),
+            ("passes", f"{len(self.passes)} of up to {rows} rows, on {self.threads} threads"),
+            ("tiles", f"up to {n_tiles} a pass, of up to {tile:,} receivers each"),
             ("memory", " + ".join(f"{name} {format_bytes(size)}" for name, size in always)),
             ("", "and, in turn, " + ", ".join(f"{format_bytes(size)} {name}" for name, size in stages)),
             ("needed", f"{format_bytes(self.needed_bytes)} of {format_bytes(self.limit_bytes)}"),
@@ -135,13 +142,14 @@ def make_plan(
     n_words = max(-(-light.samples // 64) for light in lights)
     row_bytes = (window[2] - window[0]) * _pixel_bytes(n_words)
     write_bytes = _ENCODE_BYTES + (window[2] - window[0]) * (window[3] - window[1]) * _PREVIEW_BYTES
-    source, ingest_bytes, blocker_bytes = _place_blockers(geometry, free, row_bytes)
-    least = max(ingest_bytes, blocker_bytes + row_bytes, write_bytes)
+    light_bytes = max(light.samples * light.sets for light in lights) * _SAMPLE_BYTES
+    source, ingest_bytes, blocker_bytes = _place_blockers(geometry, free, light_bytes + row_bytes)
+    least = max(ingest_bytes, blocker_bytes + light_bytes + row_bytes, write_bytes)
     if free < least:
         before = 0 if process_limit else resident_bytes
         enough = limit_bytes - free + least - before
         raise MemoryLimitError(_refusal(resolution, window, n_words, limit_bytes - before, enough))
-    passes = _bands(window, (free - blocker_bytes) // row_bytes)
+    passes = _bands(window, (free - blocker_bytes - light_bytes) // row_bytes)
     return RenderPlan(
         resolution=resolution,
         window=window,
@@ -156,7 +164,7 @@ def make_plan(
         film_bytes=film,
         ingest_bytes=ingest_bytes,
         blocker_bytes=blocker_bytes,
-        pass_bytes=max(y1 - y0 for _, y0, _, y1 in passes) * row_bytes,
+        pass_bytes=light_bytes + max(y1 - y0 for _, y0, _, y1 in passes) * row_bytes,
         write_bytes=write_bytes,
         scratch_bytes=geometry.n_triangles * _SCRATCH_TRIANGLE_BYTES if source == "temporary store" else 0,
     )
@@ -167,14 +175,16 @@ def _pixel_bytes(n_words: int) -> int:
     return max(_VISIBLE_BYTES, _GBUFFER_BYTES + _CAST_BYTES + n_words * _MASK_WORD_BYTES)
 
 
-def _place_blockers(geometry: GeometryPlan, free: int, row_bytes: int) -> tuple[BlockerSource, int, int]:
+def _place_blockers(
+    geometry: GeometryPlan, free: int, least_pass_bytes: int
+) -> tuple[BlockerSource, int, int]:
     """Where the blockers are read from, the memory to get them there, and what they then take of `free`."""
     if geometry.is_store:
         return "store", 0, _STORE_BYTES
     read_bytes = geometry.n_triangles * _READ_TRIANGLE_BYTES
     kept_bytes = geometry.n_triangles * _KEPT_TRIANGLE_BYTES
     # Half of what is free at most: the other half makes the passes few.
-    if read_bytes <= free and kept_bytes <= min(free // 2, free - row_bytes):
+    if read_bytes <= free and kept_bytes <= min(free // 2, free - least_pass_bytes):
         return "memory", read_bytes, kept_bytes
     return "temporary store", _INGEST_LEAST_BYTES, _STORE_BYTES
 

@@ -11,7 +11,7 @@ from penumbra.blockers import Blockers
 from penumbra.compile_ahead import compile_ahead
 from penumbra.errors import SceneError
 from penumbra.executors.threads import resolve_threads
-from penumbra.film import LIGHT_LAYERS, Film, Window
+from penumbra.film import BACKGROUND_ID, LIGHT_LAYERS, Film, Window
 from penumbra.image import Image, header_attributes
 from penumbra.ingest import blockers_in_memory, ingest
 from penumbra.io.atomic import temporary_folder
@@ -100,13 +100,14 @@ def render(
     if resume and not overwrite and outputs.image is not None and outputs.image.exists():
         return finished_image(outputs.image, settings)
     outputs.refuse_existing(overwrite)
+    scratch_parent = outputs.scratch_parent(scratch)
     cast_receivers = backend_named(backend)
     plan = _make_plan(scene, window, memory, process_limit, threads)
     run = Stats(backend)
     with run.timed("compile"):
         compile_ahead(progress)
     film = Film(*plan.resolution, window, [light.name for light in scene.lights])
-    with _open_blockers(scene, plan, outputs.scratch_parent(scratch), run, progress) as blockers:
+    with _open_blockers(scene, plan, scratch_parent, run, progress) as blockers:
         for band in plan.passes:
             _render_band(scene, blockers, band, cast_receivers, plan.threads, film, run, progress)
     image = _develop(film, scene, settings, plan, run)
@@ -171,7 +172,7 @@ def plan_render(
     Raises what `render` would raise before its work begins, but for outputs that are there already.
     """
     scene, window = _effective_scene(scene, crop, seed, samples, resolution)
-    _checked_outputs(scene, output, preview, stats)
+    _checked_outputs(scene, output, preview, stats).scratch_parent(scratch)
     backend_named(backend)
     return _make_plan(scene, window, memory, process_limit, threads)
 
@@ -248,6 +249,10 @@ def _measure_geometry(scene: Scene) -> GeometryPlan:
                 n_triangles += source.size_bytes // _LEAST_TRIANGLE_BYTES
             else:
                 n_triangles += source.n_triangles
+    if is_exact and n_triangles > BACKGROUND_ID:
+        raise SceneError(
+            f"the geometry has {n_triangles:,} triangles: the id layer has 32 bits; leave some out"
+        )
     return GeometryPlan(n_triangles, is_exact, len(scene.geometry) == 1 and scene.geometry[0].is_store)
 
 

@@ -210,6 +210,27 @@ def corners_on_segments(rng: Rng, light: RectLight) -> SmallScene:
     return SmallScene(points, np.concatenate([first[:, None], others], axis=1), light)
 
 
+def near_misses(rng: Rng, light: RectLight) -> SmallScene:
+    """As corners_on_segments, but off by about what float32 resolves: what its lanes must leave open."""
+    scene = corners_on_segments(rng, light)
+    shifts = rng.normal(0, 1, (8, 1, 3)) * 10.0 ** rng.uniform(-8.5, -6.5, (8, 1, 1))
+    return replace(scene, triangles=scene.triangles + shifts)
+
+
+def close_to_the_light(rng: Rng, light: RectLight) -> SmallScene:
+    """Blockers that almost touch a sample, and receivers far behind their corners and edges."""
+    samples = _samples(rng, light, 8)
+    gaps = 10.0 ** rng.uniform(-9, -2, (8, 1))
+    vertices = samples + gaps * (rng.uniform(-1, 1, (8, 3)) - np.array([0, 0, 1.5]))
+    sizes = 10.0 ** rng.uniform(-9, 1, (8, 1, 1))
+    others = vertices[:, None] + rng.normal(0, 1, (8, 2, 3)) * sizes
+    blockers = np.concatenate([vertices[:, None], others], axis=1)
+    hiding = np.concatenate([vertices, 0.5 * (blockers[:, 0] + blockers[:, 1]), others[:, 0]])
+    away = hiding - np.tile(samples, (3, 1))
+    points = hiding + away * (10.0 ** rng.uniform(-1, 1, (24, 1)) / np.abs(away).max(axis=1, keepdims=True))
+    return SmallScene(points, blockers, light)
+
+
 def facing(rng: Rng, light: RectLight) -> SmallScene:
     """Normals at right angles to directions to samples, exactly or nearly, of all lengths."""
     points = receivers_below(rng, 10)
@@ -255,6 +276,8 @@ FAMILIES: dict[str, Callable[[Rng, RectLight], SmallScene]] = {
         in_the_light_plane,
         planes_through_receivers,
         corners_on_segments,
+        near_misses,
+        close_to_the_light,
         facing,
         nearly_touching,
         degenerate_blockers,

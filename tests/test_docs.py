@@ -62,6 +62,11 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not missing
 
 
+def test_every_page_is_in_the_index() -> None:
+    listed = set(_LINK.findall((ROOT / "docs" / "index.md").read_text()))
+    assert {page.name for page in (ROOT / "docs").glob("*.md")} - {"index.md"} <= listed
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_no_page_speaks_of_one_machine(page: Path) -> None:
     assert not _MACHINE_PATH.search(page.read_text())

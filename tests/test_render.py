@@ -249,6 +249,10 @@ def test_resume(scene_path, tmp_path):
     assert output.stat().st_mtime_ns == before
     assert_same_layers(again.layers, first.layers)
     assert (again.resolution, again.window) == (first.resolution, first.window)
+    again.write(tmp_path / "copy.exr")
+    copied, header = read_header(tmp_path / "copy.exr"), read_header(output)
+    assert copied.keys() == header.keys()
+    assert all(np.array_equal(copied[name], header[name]) for name in header)
     with pytest.raises(OutputError, match=r"lights\[0\]\.samples 40 -> 41"):
         penumbra.render(scene_path, output, resume=True, samples=41)
     with pytest.raises(OutputError, match="crop"):
@@ -288,6 +292,7 @@ def test_an_output_that_is_there_is_kept(scene_path, tmp_path):
         ({"backend": "magic"}, BackendError, "magic"),
         ({"memory": "8MiB"}, MemoryLimitError, r"give \d+MiB or more"),
         ({"memory": "lots"}, SceneError, "not a size"),
+        ({"scratch": "nowhere"}, OutputError, "does not exist"),
         ({"threads": -2}, SceneError, "threads is -2"),
         ({"samples": 0}, SceneError, "samples"),
         ({"resolution": (0, 5)}, SceneError, "resolution"),
