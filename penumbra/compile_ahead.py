@@ -32,8 +32,9 @@ def compile_ahead(progress: Progress) -> None:
     progress.stage("compile: once for every version", None, "")
     here = str(Path(__file__).resolve().parents[1])
     path = os.pathsep.join([here, *filter(None, [os.environ.get("PYTHONPATH")])])
+    # -P: a folder named penumbra where the user stands must not be taken for this package.
     done = subprocess.run(
-        [str(interpreter), "-c", _CODE],
+        [str(interpreter), "-P", "-c", _CODE],
         env={**os.environ, _INSIDE: "1", "PYTHONPATH": path},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,

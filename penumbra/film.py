@@ -10,9 +10,8 @@ P.X P.Y P.Z                        0            receiver point, world space
 N.X N.Y N.Z                        0            unit geometric normal turned to the camera, world space
 id                                 0xffffffff   triangle index
 
-Background pixels hold no receiver: every quantity is 0 there, as in Mitsuba's and pbrt's AOVs, so sums
-and premultiplied compositing are right; only the depth is infinite, so that a depth merge puts
-everything else in front of it.
+Background pixels hold no receiver: every quantity is 0 there, so that sums and premultiplied compositing
+are right; only the depth is infinite, so that a depth merge puts everything else in front of it.
 """
 
 import math

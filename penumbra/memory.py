@@ -1,5 +1,7 @@
 """How much memory this process holds, has held and may still take; sizes in bytes."""
 
+import contextlib
+import ctypes
 import os
 import re
 import sys
@@ -50,6 +52,16 @@ def call_limit_bytes(memory: int | None, process_limit: bool) -> int:
     if process_limit:
         return max(0, memory - resident_bytes())
     return memory
+
+
+def give_back() -> None:
+    """Return freed memory to the system, where the C library can (glibc's malloc_trim).
+
+    Tiles are allocated by several threads in sizes that malloc keeps for later: without this the resident
+    memory of a second light or pass stands on what the first one left (measured: 35 bytes a pixel).
+    """
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def format_bytes(n_bytes: int) -> str:

@@ -18,7 +18,7 @@ from penumbra.io.atomic import temporary_folder
 from penumbra.io.blocker_store import open_store
 from penumbra.io.exr import camera_attributes
 from penumbra.io.meshes import open_mesh
-from penumbra.memory import call_limit_bytes, resident_bytes
+from penumbra.memory import call_limit_bytes, give_back, resident_bytes
 from penumbra.options import CastOptions, parse_size
 from penumbra.outputs import Outputs, finished_image
 from penumbra.plan import GeometryPlan, LightPlan, RenderPlan, make_plan
@@ -58,40 +58,18 @@ def render(
 ) -> Image:
     """Render a scene with exact soft shadows, and write it if `output` is given.
 
-    Parameters
-    ----------
-    scene
-        A Scene, or the path of a scene file.
-    output, preview, stats
-        Files to write: OpenEXR, an exposed PNG, counters and seconds as JSON.
-    memory
-        Bytes that this call may add to the resident memory, or a size such as "2GiB"; None is half of the
-        free memory. With `process_limit` the limit is of the whole process.
-    backend
-        "hpc", "reference" or "auto"; all give the same bits.
-    threads
-        0 for all cores.
-    crop
-        (x0, y0, x1, y1), half-open, from the upper left: exactly these pixels of the full picture.
-    seed, samples, resolution
-        In place of the scene's, for every light.
-    scratch
-        Folder of the temporary store of geometry that does not fit in memory; beside `output` by default.
-    resume
-        Do nothing when `output` is there and was rendered with the same settings.
-    overwrite
-        Replace `output` if it is there.
+    scene: a Scene, or the path of a scene file. output, preview, stats: files to write, as OpenEXR,
+    exposed PNG and JSON. memory: bytes that this call may add to the resident memory, or a size such as
+    "2GiB"; None is half of the free memory; with `process_limit` the limit is of the whole process.
+    backend: "hpc", "reference" or "auto"; all give the same bits. threads: 0 for all cores. crop:
+    (x0, y0, x1, y1), half-open, from the upper left: exactly these pixels of the full picture. seed,
+    samples, resolution: in place of the scene's. scratch: folder of the temporary store of geometry that
+    does not fit in memory, beside `output` by default. resume: do nothing when `output` is there and was
+    rendered with the same settings. overwrite: replace `output` if it is there.
 
-    Raises
-    ------
-    SceneError, MeshError, BlockerStoreError
-        Input that cannot be used.
-    OutputError
-        An output that is there already, or cannot be written.
-    MemoryLimitError
-        The limit cannot be met; the message has one that would do. Nothing has been done by then.
-    BackendError
-        There is no such backend.
+    Raises SceneError, MeshError or BlockerStoreError for input that cannot be used, OutputError for an
+    output that is there or cannot be written, BackendError for an unknown backend, and MemoryLimitError,
+    before any work, when the limit cannot be met: the message has one that would do.
     """
     progress = progress or NullProgress()
     scene, window = _effective_scene(scene, crop, seed, samples, resolution)
@@ -147,6 +125,8 @@ def _render_band(
             # The masks of one light must not be there while the next is cast.
             del masks
             _put_shading(film, light.name, seen, shading)
+            del shading
+            give_back()
 
 
 def plan_render(
@@ -278,6 +258,7 @@ def _open_blockers(
                     progress=progress,
                 )
             stack.callback(blockers.close)
+            give_back()
         run.count("n_triangles", blockers.n_triangles)
         run.count("n_dropped", blockers.n_dropped)
         yield blockers

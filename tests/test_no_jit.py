@@ -25,11 +25,13 @@ def cast_both() -> np.ndarray:
     points, normals = rng.uniform(-2, 2, (40, 3)), rng.normal(size=(40, 3))
     light = penumbra.RectLight([-1, 3, -1], [2, 0.3, 0], [0, 0.2, 2], samples=70, sets=3)
     options = penumbra.CastOptions(tile_receivers=30, leaf_receivers=4, rebuild_fraction=0.1)
-    results = [
-        penumbra.cast(points, blockers, light, normals=normals, backend=backend, options=options, threads=1).masks
-        for backend in ("reference", "hpc")
-    ]
-    return np.array(results)
+    masks = []
+    for backend in ("reference", "hpc"):
+        result = penumbra.cast(
+            points, blockers, light, normals=normals, backend=backend, options=options, threads=1
+        )
+        masks.append(result.masks)
+    return np.array(masks)
 
 
 def test_kernels_give_the_same_bits_without_jit(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ option          commands               meaning
 --threads       render                 0: all
 --crop          render                 the part of the picture to render
 --seed          render                 of the light samples
---resume        render                 go on where a stopped run was
+--resume        render                 keep a finished image of the same settings
 --preview       render                 also a PNG
 --stats         render                 also counters and seconds as JSON
 --dry-run       render                 print the plan only
@@ -171,7 +171,9 @@ seed = click.option(
     show_default=True,
     help="Seed of the light samples.",
 )
-resume = click.option("--resume", is_flag=True, help="Go on where a run that was stopped left off.")
+resume = click.option(
+    "--resume", is_flag=True, help="Do nothing where a finished image of the same settings is there."
+)
 preview = click.option(
     "--preview", metavar="OUT.png", type=_FILE, help="Also write a PNG of the direct light on 0.8 grey."
 )
