@@ -3,6 +3,8 @@
 numba counts references of every array it takes out of a tuple, with an atomic increment and
 decrement each time; in the casting kernel these were most of the run time. A kernel's
 arguments outlive it, so it may borrow them: the same arrays with no owner, whose counting is a no-op.
+A helper that is not inlined borrows again: only where LLVM sees that there is no owner does it drop
+the counting altogether (a third of the time of casting).
 """
 
 from typing import Any

@@ -84,6 +84,7 @@ def _block_group(blocker, side, bvh, slot, light, group, n_samples, known, scrat
 @helper
 def _build_group_volumes(blocker, light, scratch, counters):
     """C: penumbra volumes of all groups (HPC figure 3, line 62)."""
+    blocker, light, scratch = borrow(blocker), borrow(light), borrow(scratch)
     n_groups = light.full_groups.shape[0]
     choices = scratch.choices[1]
     for group in range(n_groups):
@@ -201,6 +202,7 @@ def _cast_on_leaf(blocker, node, level, built, bvh, pool, light, group_size, swi
 @helper
 def _start_blocker(tri, tri_id, shaft, light, scratch, counters):
     """Build V_L, activate all groups, and return the Blocker (HPC figure 3, lines 30 to 33)."""
+    shaft, light, scratch = borrow(shaft), borrow(light), borrow(scratch)
     fill_normal(tri, scratch.normal)
     extent = shaft.extent
     for k in range(3):
@@ -231,8 +233,10 @@ def _start_blocker(tri, tri_id, shaft, light, scratch, counters):
 @helper
 def _cast_blocker(tri, tri_id, shaft, bvh, pool, light, group_size, switches, scratch, counters):
     """Cast one blocker through the hierarchy; False if the mask pool ran empty."""
+    shaft, bvh, pool, light = borrow(shaft), borrow(bvh), borrow(pool), borrow(light)
+    scratch, counters, tri = borrow(scratch), borrow(counters), borrow(tri)
     counters[BLOCKERS_TESTED] += 1
-    blocker = _start_blocker(tri, tri_id, shaft, light, scratch, counters)
+    blocker = borrow(_start_blocker(tri, tri_id, shaft, light, scratch, counters))
     built = blocker.amplify == np.inf
     if not built and not switches.lazy_volumes:
         _build_group_volumes(blocker, light, scratch, counters)

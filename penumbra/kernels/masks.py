@@ -4,6 +4,7 @@ import numpy as np
 
 from penumbra.kernels._jit import helper, inlined, kernel
 from penumbra.kernels.bits import ONE, ZERO
+from penumbra.kernels.borrow import borrow
 from penumbra.kernels.counters import MASKS_ALLOCATED, MASKS_RELEASED
 
 MASK_NONE = np.int32(-1)
@@ -65,6 +66,7 @@ def node_is_umbra(bvh, node, n_groups):
 @helper
 def update_leaf_umbra(bvh, node, pool, light, group_size):
     """A: group-umbra bits of a leaf, the AND over its receivers (HPC figure 3, lines 77 to 80)."""
+    bvh, pool, light = borrow(bvh), borrow(pool), borrow(light)
     n_groups = light.full_groups.shape[0]
     for word in range(bvh.umbra.shape[1]):
         bvh.umbra[node, word] = ZERO

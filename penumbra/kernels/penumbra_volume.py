@@ -15,6 +15,7 @@ Both go into the slack of d, some 1e-12 of the scene's size in ordinary scenes.
 import numpy as np
 
 from penumbra.kernels._jit import helper, inlined
+from penumbra.kernels.borrow import borrow
 from penumbra.kernels.lanes import bits_above, bits_not_below, greater, lesser, load, splat
 from penumbra.kernels.predicates import OVERFLOW, UNDERFLOW, UNIT_ROUNDOFF
 
@@ -137,6 +138,8 @@ def fill_volume(blocker, normal, light, polygon, choices, planes):
     the corner that each of the first seven planes went through: that of the whole light is nearly
     always right for its groups, which saves three quarters of the candidates.
     """
+    blocker, normal, light = borrow(blocker), borrow(normal), borrow(light)
+    choices, planes = borrow(choices), borrow(planes)
     found = np.int64(0)
     tri, extent, amplify = blocker.corners, blocker.extent, blocker.amplify
     residual = light.residual
