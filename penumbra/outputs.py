@@ -37,16 +37,14 @@ class Outputs:
             taken.add(path.resolve())
             remove_dead_temporaries(path)
 
-    def refuse_existing(self, overwrite: bool) -> None:
-        """Raise OutputError if the image is there and must not be replaced.
-
-        The preview and the numbers belong to the image and are replaced with it.
-        """
-        if self.image is not None and self.image.exists() and not overwrite:
-            raise OutputError(
-                f"{self.image} is there already: give --overwrite to replace it, --resume to keep it if it "
-                "is finished, or another output"
-            )
+    def refuse_existing(self) -> None:
+        """Raise OutputError if one of the files is there and would be replaced."""
+        for path in (self.image, self.preview, self.stats):
+            if path is not None and path.exists():
+                raise OutputError(
+                    f"{path} is there already: give --overwrite to replace it, --resume to keep a finished "
+                    "image, or another output"
+                )
 
     def scratch_parent(self, scratch: str | Path | None) -> Path:
         """Folder for temporary files: the one asked for, else beside the image. Raises OutputError."""

@@ -77,7 +77,9 @@ def render(
     outputs = _checked_outputs(scene, output, preview, stats)
     if resume and not overwrite and outputs.image is not None and outputs.image.exists():
         return finished_image(outputs.image, settings)
-    outputs.refuse_existing(overwrite)
+    # A killed run may have left a preview; --resume begins again and replaces it.
+    if not (overwrite or resume):
+        outputs.refuse_existing()
     scratch_parent = outputs.scratch_parent(scratch)
     cast_receivers = backend_named(backend)
     plan = _make_plan(scene, window, memory, process_limit, threads)

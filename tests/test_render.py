@@ -283,6 +283,15 @@ def test_an_output_that_is_there_is_kept(scene_path, tmp_path):
     assert "id" in read_layers(output)
 
 
+@pytest.mark.parametrize("what", ["preview", "stats"])
+def test_a_preview_or_numbers_that_are_there_are_kept(scene_path, tmp_path, what):
+    kept = tmp_path / "kept"
+    kept.write_text("precious")
+    with pytest.raises(OutputError, match="kept is there already"):
+        penumbra.render(scene_path, tmp_path / "out.exr", **{what: kept})
+    assert kept.read_text() == "precious" and not (tmp_path / "out.exr").exists()
+
+
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
