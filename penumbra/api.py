@@ -1,5 +1,6 @@
 """The Python calls that need no camera: `cast`, and `camera_receivers` to cast what a camera sees."""
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -8,17 +9,15 @@ import numpy as np
 
 from penumbra.arrays import Float32Array, Float64Array, Int64Array, Receivers, UInt8Array, UInt64Array
 from penumbra.blockers import Blockers
-from penumbra.errors import BackendError, MemoryLimitError, SceneError
+from penumbra.errors import BackendError, SceneError
 from penumbra.executors.threads import resolve_threads
 from penumbra.lights import RectLight
-from penumbra.memory import call_limit_bytes, format_bytes
+from penumbra.memory import call_limit_bytes
 from penumbra.options import CastOptions, IngestOptions, parse_size
+from penumbra.plan import array_bytes, receivers_per_pass
 from penumbra.progress import NullProgress, Progress
 from penumbra.scene import Scene
 from penumbra.stats import Stats
-
-# Receivers, their copy in tiles with the hierarchy, facing state; masks come on top (measured: 150).
-_RECEIVER_BYTES = 192
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +55,8 @@ def cast(
     (T, 3, 3), whose float64 values are used as given. normals: (R, 3); samples with n . (l - r) <= 0
     count as blocked. own: (R,) index of the triangle each point lies on (it never blocks that point),
     -1 for none. index: (R,) what the sample set is hashed from, the row by default. memory: bytes this
-    call may add, e.g. "2GiB"; None is half of the free memory. threads: 0 for all.
+    call may add, e.g. "2GiB"; None is half of the free memory (compiled kernels take some 100 MB of a
+    process once, on top). threads: 0 for all.
 
     Raises SceneError for input that is not usable (it names the row), MemoryLimitError when the
     result cannot fit, BackendError for an unknown backend.
@@ -66,13 +66,20 @@ def cast(
     if keep not in ("masks", "visibility"):
         raise SceneError(f"keep is {keep!r}: give 'masks' or 'visibility'")
     limit = call_limit_bytes(parse_size(memory), process_limit=False)
-    n_words = -(-light.samples // 64)
-    per_pass = _receivers_per_pass(len(receivers.points), n_words, keep, limit)
-    blockers, opened_here = _open_blockers(blockers, options)
-    try:
+    given = _checked_blockers(blockers)
+    with ExitStack() as stack:
+        if not isinstance(given, np.ndarray) and given is not blockers:
+            stack.callback(given.close)
+        per_pass = receivers_per_pass(
+            len(receivers.points), light.samples, light.sets, _blocker_bytes(given), keep == "masks", limit
+        )
+        if isinstance(given, np.ndarray):
+            from penumbra.ingest import blockers_in_memory
+
+            given = blockers_in_memory(given, IngestOptions(sort=options.sort))
         return _cast_in_passes(
             receivers,
-            blockers,
+            given,
             light,
             per_pass,
             keep,
@@ -81,9 +88,6 @@ def cast(
             threads=resolve_threads(threads),
             progress=progress or NullProgress(),
         )
-    finally:
-        if opened_here:
-            blockers.close()
 
 
 def camera_receivers(scene: Scene | str | Path) -> tuple[Float64Array, Float64Array, Int64Array, Int64Array]:
@@ -148,33 +152,26 @@ def _cast_in_passes(
     return CastResult(masks, sample_set, visibility, stats)
 
 
-def _receivers_per_pass(n_receivers: int, n_words: int, keep: str, limit: int) -> int:
-    """How many receivers fit at once beside the result; raises MemoryLimitError if too few do."""
-    result = n_receivers * (5 + (8 * n_words if keep == "masks" else 0))
-    per_receiver = _RECEIVER_BYTES + 2 * 8 * n_words
-    least = min(n_receivers, 1024) * per_receiver
-    if result + least > limit:
-        raise MemoryLimitError(
-            f"casting {n_receivers} points needs {format_bytes(result + least)} and the limit is"
-            f" {format_bytes(limit)}: raise memory, or cast fewer points at a time"
-        )
-    return max(1, min(n_receivers, (limit - result) // per_receiver))
-
-
-def _open_blockers(blockers: Any, options: CastOptions) -> tuple[Blockers, bool]:
-    """Blockers of any accepted kind, and whether they were opened here and are to be closed here."""
+def _checked_blockers(blockers: Any) -> Blockers | Float64Array:
+    """Blockers as they are, a store opened, or triangles (T, 3, 3) of an array or a Trimesh."""
     if isinstance(blockers, str | Path):
         from penumbra.io.blocker_store import open_store
 
-        return open_store(blockers), True
+        return open_store(blockers)
     if hasattr(blockers, "chunks") and hasattr(blockers, "read"):
-        return blockers, False
-    from penumbra.ingest import blockers_in_memory
-
+        opened: Blockers = blockers
+        return opened
     # trimesh.Trimesh is recognised by what it has, so that trimesh need not be imported.
     values = blockers.triangles if hasattr(blockers, "triangles") else blockers
-    triangles = _checked(values, "blockers", (None, 3, 3))
-    return blockers_in_memory(triangles, IngestOptions(sort=options.sort)), True
+    return _checked(values, "blockers", (None, 3, 3))
+
+
+def _blocker_bytes(blockers: Blockers | Float64Array) -> int:
+    """Memory that the blockers take in this call: an array is sorted, of a store two chunks are held."""
+    if isinstance(blockers, np.ndarray):
+        return array_bytes(len(blockers))
+    # Two chunks at a time, each as it is read and as float64.
+    return 4 * max((chunk.n_bytes for chunk in blockers.chunks), default=0)
 
 
 def _checked_receivers(points: Any, normals: Any, own: Any, index: Any) -> Receivers:
@@ -202,10 +199,13 @@ def _checked(values: Any, what: str, shape: tuple[int | None, ...]) -> Float64Ar
     """C-contiguous, writable float64 array of a shape (None: any length) with finite values."""
     wanted = "(" + ", ".join("n" if size is None else str(size) for size in shape) + ")"
     try:
-        array = np.require(np.asarray(values), np.float64, ["C", "W"])
+        given = np.asarray(values)
+        if given.dtype.kind == "c":
+            raise TypeError
+        array = np.require(given, np.float64, ["C", "W"])
     except (TypeError, ValueError):
         raise SceneError(f"{what} cannot be read as numbers: give an array of shape {wanted}") from None
-    if array.size == 0 and shape[0] in (None, 0):
+    if array.shape == (0,) and shape[0] in (None, 0):
         return np.zeros((0, *(size or 0 for size in shape[1:])))
     if array.ndim != len(shape) or any(s not in (None, n) for s, n in zip(shape, array.shape, strict=True)):
         raise SceneError(f"{what} has shape {array.shape}: give an array of shape {wanted}")
@@ -221,4 +221,6 @@ def _checked_integers(values: Any, what: str, n_receivers: int) -> Int64Array:
         raise SceneError(
             f"{what} has shape {array.shape} and type {array.dtype}: give {n_receivers} whole numbers"
         )
+    if array.size and array.max() > np.iinfo(np.int64).max:
+        raise SceneError(f"{what} row {array.argmax()} is {array.max()}: numbers must be below 2**63")
     return np.require(array, np.int64, ["C", "W"])

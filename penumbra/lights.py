@@ -53,10 +53,13 @@ class RectLight:
         keep("name", str(name))
         for field, vector in (("corner", corner), ("edge_u", edge_u), ("edge_v", edge_v)):
             keep(field, _vector(vector, f"{field} of light '{name}'"))
+        reach = np.abs(self.corner) + np.abs(self.edge_u) + np.abs(self.edge_v)
+        if not np.isfinite(reach).all():
+            raise SceneError(f"light '{name}' reaches beyond the largest number: make it smaller")
         whole = (
             ("samples", samples, 1, MAX_SAMPLES),
             ("sets", sets, 1, MAX_SETS),
-            ("seed", seed, 0, 2**63 - 1),
+            ("seed", seed, 0, MAX_SEED),
         )
         for field, value, low, high in whole:
             keep(field, _whole_number(value, f"{field} of light '{name}'", low, high))
@@ -83,6 +86,8 @@ class RectLight:
         """Light samples, float64 (sets, K, 3), world space; consecutive samples are neighbours."""
         s, t = np.moveaxis(self._parameters, -1, 0)
         points: Float64Array = self.corner + s[..., None] * self.edge_u + t[..., None] * self.edge_v
+        # Casting keeps a copy of its own: a light whose samples could be changed would not be that light.
+        points.setflags(write=False)
         return points
 
     @cached_property
@@ -90,7 +95,9 @@ class RectLight:
         """(sets, K, 2): positions of the samples along edge_u and edge_v, in [0, 1)."""
         low, size = _strata(self.samples, _length(self.edge_u), _length(self.edge_v))
         jitter = np.random.default_rng(self.seed).random((self.sets, self.samples, 2))
-        return low + jitter * size
+        parameters: Float64Array = low + jitter * size
+        parameters.setflags(write=False)
+        return parameters
 
     def light_samples(self, group_size: int) -> LightSamples:
         """Light, groups and samples as casting wants them (HPC section 3.1), `group_size` bits a group."""

@@ -16,6 +16,8 @@ BlockerSource = Literal["store", "memory", "temporary store"]
 _GBUFFER_BYTES = 72  # a pixel of a pass: its pixel, point, normal, triangle and depth
 _VISIBLE_BYTES = 112  # a pixel while visible points are found, its place in the G-buffer included
 _CAST_BYTES = 112  # a receiver while it is cast and shaded: place in its tile, hierarchy, facing, results
+_RECEIVER_BYTES = 64  # a receiver as it is passed to casting: point, normal, triangle, index
+_RESULT_BYTES = 5  # a receiver in the result, without its mask
 _MASK_WORD_BYTES = 16  # 64 light samples of a receiver: in the result, and at worst in its tile's pool too
 _SAMPLE_BYTES = 64  # a light sample of one set, as point and as lane
 _PREVIEW_BYTES = 24  # a pixel while the picture is exposed
@@ -168,6 +170,31 @@ def make_plan(
         write_bytes=write_bytes,
         scratch_bytes=geometry.n_triangles * _SCRATCH_TRIANGLE_BYTES if source == "temporary store" else 0,
     )
+
+
+def receivers_per_pass(
+    n_receivers: int, n_samples: int, sets: int, blocker_bytes: int, keep_masks: bool, limit_bytes: int
+) -> int:
+    """How many of the receivers of one `cast` are cast at a time, beside blockers, light and result.
+
+    Raises MemoryLimitError when fewer than 1024 of them, or than all, would fit.
+    """
+    n_words = -(-n_samples // 64)
+    held = n_samples * sets * _SAMPLE_BYTES + blocker_bytes
+    held += n_receivers * (_RESULT_BYTES + (8 * n_words if keep_masks else 0))
+    receiver_bytes = _RECEIVER_BYTES + _CAST_BYTES + n_words * _MASK_WORD_BYTES
+    least = held + min(n_receivers, 1024) * receiver_bytes
+    if least > limit_bytes:
+        raise MemoryLimitError(
+            f"casting {n_receivers} points needs {format_bytes(least)} and the limit is"
+            f" {format_bytes(limit_bytes)}: raise memory, cast fewer points at a time, or name a store"
+        )
+    return max(1, min(n_receivers, (limit_bytes - held) // receiver_bytes))
+
+
+def array_bytes(n_triangles: int) -> int:
+    """Memory of an array of triangles while it is sorted for casting."""
+    return n_triangles * _READ_TRIANGLE_BYTES
 
 
 def _pixel_bytes(n_words: int) -> int:

@@ -15,10 +15,9 @@ from penumbra.arrays import (
     UInt64Array,
 )
 from penumbra.kernels.masks import MASK_NONE, MASK_UMBRA, fill_umbra
-from penumbra.kernels.receiver_bvh import build_bvh
+from penumbra.kernels.receiver_bvh import HALVING_COUNT, build_bvh
 from penumbra.kernels.shaft import N_SHAFT_PLANES, fill_shaft, runs_touch_shaft
 
-_HALVING_LIMIT = 1024
 _FIRST_MASKS = 64
 
 
@@ -161,7 +160,7 @@ def _build(
 ) -> tuple[Float64Array, Int32Array, Int32Array, Int32Array, int]:
     """Hierarchy over the points listed in order, which it permutes; arrays cut to the nodes there are."""
     # A cut leaves at least a 32nd on either side above the halving limit, one point below it.
-    leaves = len(order) if leaf_size <= _HALVING_LIMIT else 32 * len(order) // leaf_size + 1
+    leaves = len(order) if leaf_size <= HALVING_COUNT else 32 * len(order) // leaf_size + 1
     room = 2 * leaves + 1
     boxes = np.empty((room, 6))
     first, count, child = (np.empty(room, np.int32) for _ in range(3))

@@ -70,7 +70,7 @@ def shade(
     Samples behind the receiver, or behind a single-sided light, add nothing; a two-sided light counts
     |cos|. `threads`: 0 for all cores. The result depends neither on it nor on the other receivers.
     """
-    samples = np.ascontiguousarray(np.swapaxes(light.sample_points, 1, 2), dtype=np.float64)
+    samples = np.array(np.swapaxes(light.sample_points, 1, 2), dtype=np.float64, order="C")
     n, n_samples = len(points), samples.shape[2]
     shading = np.empty((3, n), dtype=np.float32)
     arrays = (

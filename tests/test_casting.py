@@ -6,8 +6,9 @@ import pytest
 
 from penumbra.api import cast
 from penumbra.arrays import Blocker, Receivers
+from penumbra.errors import MemoryLimitError
 from penumbra.facing import full_mask
-from penumbra.kernels import lanes
+from penumbra.kernels import _jit, lanes
 from penumbra.kernels.borrow import borrow
 from penumbra.kernels.hard_shadow import fill_normal
 from penumbra.kernels.penumbra_volume import contains_point, fill_volume, light_gap
@@ -202,3 +203,65 @@ def test_engine_equals_brute_force_where_masks_and_hierarchies_change_often(rng)
         CastOptions(group_size=64, rebuild_fraction=1.0),
     ):
         assert np.array_equal(cast(points, blockers, light, options=options).masks, expected)
+
+
+@numba.njit
+def _gap(tri, light):
+    return light_gap(tri, light)
+
+
+def test_gap_is_never_more_than_the_distance_to_the_light(rng):
+    """Also for edges that are parallel up to rounding, whose cross product is no normal of the light."""
+    for trial in range(400):
+        u = rng.normal(size=3)
+        v = rng.normal() * u * (1 + 1e-16 * rng.normal(size=3)) if trial % 2 else rng.normal(size=3)
+        light = RectLight(rng.normal(size=3), u, v, samples=16, sets=2)
+        points = light.sample_points.reshape(-1, 3)
+        near = points[rng.integers(len(points))] + rng.normal(size=3) * 10.0 ** rng.uniform(-12, 0)
+        tri = near + np.concatenate([np.zeros((1, 3)), rng.normal(size=(2, 3))])
+        closest = np.linalg.norm(points - tri[0], axis=1).min()
+        assert _gap(tri, light.light_samples(32)) <= closest
+
+
+def test_lights_with_nearly_parallel_edges_equal_brute_force(rng):
+    for _ in range(60):
+        u = rng.normal(size=3)
+        light = RectLight(rng.normal(size=3), u, u * rng.normal() * (1 + 2e-16), samples=33, two_sided=True)
+        ends = light.sample_points[0, rng.integers(33, size=40)]
+        near = ends + rng.normal(size=(40, 3)) * 10.0 ** rng.uniform(-11, 0, (40, 1))
+        blockers = near[:, None, :] + rng.normal(size=(40, 3, 3)) * 10.0 ** rng.uniform(-9, 0, (40, 1, 1))
+        # Receivers behind edges of blockers, seen from samples: on the border of many shadows.
+        edge = blockers[:, 0] + rng.random((40, 1)) * (blockers[:, 1] - blockers[:, 0])
+        points = edge + rng.exponential(2, (40, 1)) * (edge - ends)
+        expected = cast(points, blockers, light, backend="reference").masks
+        assert np.array_equal(cast(points, blockers, light).masks, expected)
+
+
+@pytest.mark.parametrize("width", [1e-310, 5e-324, 1e-200, 1.7e308])
+def test_hierarchy_of_points_that_differ_by_almost_nothing_or_overflow(width, rng):
+    points = rng.uniform(-1, 1, (200, 3)) * width
+    order, *_ = build(points, 4)
+    assert sorted(order) == list(range(200))
+
+
+def test_samples_of_a_light_cannot_be_changed():
+    with pytest.raises(ValueError, match="read-only"):
+        RectLight([0, 0, 0], [1, 0, 0], [0, 1, 0]).sample_points[0, 0] = 1.0
+
+
+def test_memory_counts_blockers_and_light_samples(rng):
+    points, triangles = rng.random((10, 3)), rng.random((100_000, 3, 3))
+    light = RectLight([0, 2, 0], [1, 0, 0], [0, 0, 1], samples=16)
+    with pytest.raises(MemoryLimitError, match="25.0 MiB|24.8 MiB"):
+        cast(points, triangles, light, memory="20MiB")
+    many = RectLight([0, 2, 0], [1, 0, 0], [0, 0, 1], samples=65536, sets=64)
+    with pytest.raises(MemoryLimitError):
+        cast(points, triangles[:2], many, memory="100MiB")
+
+
+def test_kernel_cache_changes_with_the_kernels_wherever_it_is(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    before = _jit.cache_folder()
+    assert before.is_relative_to(tmp_path)
+    monkeypatch.setattr(_jit, "_sources_hash", lambda: "another")
+    assert _jit.cache_folder() != before

@@ -24,11 +24,9 @@ def _sources_hash() -> str:
 
 
 def cache_folder() -> Path:
-    """Folder of the compiled kernels: NUMBA_CACHE_DIR, or one per source hash in the user's cache."""
-    if os.environ.get("NUMBA_CACHE_DIR"):
-        return Path(os.environ["NUMBA_CACHE_DIR"])
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "penumbra" / f"numba{numba.__version__}-{_sources_hash()}"
+    """Folder of the compiled kernels, one per source hash: in NUMBA_CACHE_DIR, or in the user's cache."""
+    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "penumbra" / f"numba{numba.__version__}-{_sources_hash()}"
 
 
 # numba reads this setting at every compilation, so assigning it before the first decorator suffices.

@@ -64,7 +64,7 @@ def _block_group(blocker, side, bvh, slot, light, group, n_samples, known, scrat
     full = light.full_groups[group]
     sample_set = np.int64(bvh.sample_set[slot])
     first = group * n_samples
-    counters[SAMPLES_TESTED] += n_samples
+    counters[SAMPLES_TESTED] += popcount64(full & ~known)
     blocked, possible = test_samples(
         scratch.edges, blocker.side == 0, light.parameters, sample_set, first, n_samples
     )

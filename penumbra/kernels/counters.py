@@ -12,7 +12,7 @@ NAMES = (
     "umbra_receivers_skipped",  # receivers left because all is blocked
     "umbra_groups_skipped",  # light sample groups left because they are blocked
     "pairs_tested",  # receiver x blocker pairs that reached the hard shadow volumes
-    "samples_tested",  # receiver x blocker x sample triples decided
+    "samples_tested",  # receiver x blocker x sample triples decided, of samples not blocked before
     "escalated_f64",  # of those, left open by float32 lanes
     "escalated_exact",  # predicates decided in exact integers
     "masks_allocated",  # masks taken from the pool

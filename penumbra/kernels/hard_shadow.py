@@ -31,7 +31,6 @@ LANE_BOUND = np.float32(8.0 * 2.0**-24)
 _COEFFICIENT_BOUND = 20.0 * UNIT_ROUNDOFF
 _SMALLEST = 1e-250
 _LARGEST = 1e250
-_ONE = np.uint64(1)
 
 
 @helper

@@ -57,7 +57,12 @@ def light_gap(tri, light):
             height = nx * (tri[k, 0] - o[0]) + ny * (tri[k, 1] - o[1]) + nz * (tri[k, 2] - o[2])
             low = min(low, height)
             high = max(high, height)
-        gap = max(gap, max(low, -high) / length)
+        # Edges parallel but for rounding give a normal that the light is far from perpendicular to.
+        thickness = 0.0
+        for j in range(4):
+            c = light.corners[0, j]
+            thickness = max(thickness, abs(nx * (c[0] - o[0]) + ny * (c[1] - o[1]) + nz * (c[2] - o[2])))
+        gap = max(gap, (max(low, -high) - thickness) / length)
     # Rounding of the bound itself, and samples that lie off the polygon of the corners.
     reach = abs(o[0]) + abs(o[1]) + abs(o[2])
     for k in range(3):

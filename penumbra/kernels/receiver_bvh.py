@@ -9,7 +9,7 @@ import numpy as np
 
 from penumbra.kernels._jit import helper, kernel
 
-_HALVING_COUNT = 1024
+HALVING_COUNT = 1024
 _BINS = 16
 
 
@@ -107,10 +107,10 @@ def _least_area_cut(points, order, first, count, box, leaf_size, bins, left, rig
     best_axis = _longest_axis(box)
     best_left = ((count // leaf_size + 1) // 2) * leaf_size
     for axis in range(3):
-        width = box[3 + axis] - box[axis]
-        if not width > 0.0:
+        scale = _BINS / (box[3 + axis] - box[axis])
+        # Not for a flat box, nor where the width or its inverse overflows: 0 * inf is no bin.
+        if not (scale > 0.0 and scale < np.inf):
             continue
-        scale = _BINS / width
         _clear(bins)
         _clear(left)
         _clear(right)
@@ -169,7 +169,7 @@ def build_bvh(points, order, leaf_size, boxes, first, count, child):
         child[node] = -1
         if size > leaf_size:
             n_left = np.int64(0)
-            if size > _HALVING_COUNT:
+            if size > HALVING_COUNT:
                 axis = _longest_axis(boxes[node])
                 middle = 0.5 * boxes[node, axis] + 0.5 * boxes[node, 3 + axis]
                 n_left = np.int64(_partition_at(points, order, start, size, axis, middle))
