@@ -62,6 +62,8 @@ def cast(
     result cannot fit, BackendError for an unknown backend.
     """
     options = options or CastOptions()
+    if not isinstance(light, RectLight):
+        raise SceneError(f"light is {light!r}: give a penumbra.RectLight")
     receivers = _checked_receivers(points, normals, own, index)
     if keep not in ("masks", "visibility"):
         raise SceneError(f"keep is {keep!r}: give 'masks' or 'visibility'")

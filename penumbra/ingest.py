@@ -152,7 +152,9 @@ def _prepare_output(output: Path, inputs: Sequence[MeshRef], scratch: Path, over
 
     check_output(output)
     if output.exists() and not overwrite:
-        raise OutputError(f"{output} is there already: choose another output, or allow to overwrite it")
+        raise OutputError(
+            f"{output} is there already: give --overwrite (overwrite=True) to replace it, or another output"
+        )
     if any(output == Path(os.path.realpath(mesh.path)) for mesh in inputs):
         raise SceneError(f"{output} is an input of this ingest: choose another output")
     if not scratch.is_dir():

@@ -155,9 +155,11 @@ def _vector(value: ArrayLike, what: str) -> Float64Array:
 
 
 def _whole_number(value: object, what: str, low: int, high: int) -> int:
-    is_number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    number = int(value) if is_number and np.isfinite(value) else low - 1  # type: ignore[call-overload]
-    if number != value or not low <= number <= high:
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if isinstance(value, float | np.floating):
+        whole = bool(np.isfinite(value)) and value == int(value)
+    number = int(value) if whole else low - 1  # type: ignore[call-overload]
+    if not low <= number <= high:
         raise SceneError(f"{what} is {value!r}: give a whole number from {low} to {high}")
     return number
 

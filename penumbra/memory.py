@@ -45,12 +45,12 @@ def call_limit_bytes(memory: int | None, process_limit: bool) -> int:
     """Bytes a call may add to the resident memory.
 
     `memory` is the limit asked for: of the whole process when `process_limit`, else of what the call
-    adds. None means half of the memory available now.
+    adds. None means half of the memory available now. Negative where the process is above it already.
     """
     if memory is None:
         return available_bytes() // 2
     if process_limit:
-        return max(0, memory - resident_bytes())
+        return memory - resident_bytes()
     return memory
 
 

@@ -92,4 +92,10 @@ def finished_image(path: Path, settings: Settings) -> Image:
     resolution = header["displayWindow"][2] + 1, header["displayWindow"][3] + 1
     attributes = {name: value for name, value in header.items() if name not in STRUCTURE}
     stats = Stats(str(attributes.get("penumbra:backend", "")))
-    return Image(read_layers(path), stats, resolution, (x0, y0, x1 + 1, y1 + 1), attributes)
+    try:
+        layers = read_layers(path)
+    except PenumbraError:
+        raise OutputError(
+            f"cannot resume {path}: its pixels cannot be read, it is not whole; {advice}"
+        ) from None
+    return Image(layers, stats, resolution, (x0, y0, x1 + 1, y1 + 1), attributes)

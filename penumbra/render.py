@@ -76,7 +76,10 @@ def render(
     settings = settings_of(scene, window)
     outputs = _checked_outputs(scene, output, preview, stats)
     if resume and not overwrite and outputs.image is not None and outputs.image.exists():
-        return finished_image(outputs.image, settings)
+        image = finished_image(outputs.image, settings)
+        if outputs.preview is not None and not outputs.preview.exists():
+            image.write_preview(outputs.preview)
+        return image
     # A killed run may have left a preview; --resume begins again and replaces it.
     if not (overwrite or resume):
         outputs.refuse_existing()

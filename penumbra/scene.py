@@ -15,6 +15,8 @@ from penumbra.arrays import Float64Array
 from penumbra.errors import SceneError
 from penumbra.lights import RectLight
 
+# OpenEXR cuts channel names at 255 bytes without a word; the longest layer adds 22.
+_LONGEST_LIGHT_NAME = 200
 RESERVED_LIGHT_NAMES = ("R", "G", "B", "A", "P", "N", "Z", "id")
 """Names that a light cannot have: they are layers or channels of the image."""
 
@@ -174,6 +176,11 @@ def check_light_names(names: Iterable[str]) -> None:
         if not name or "." in name:
             raise SceneError(
                 f"the light name {name!r} is empty or has a dot: it must do as the name of a layer"
+            )
+        if not name.isprintable() or len(name.encode()) > _LONGEST_LIGHT_NAME:
+            raise SceneError(
+                f"the light name {name[:40]!r} is too long or has characters that do not print: "
+                f"layers are named after it, so take at most {_LONGEST_LIGHT_NAME} printable bytes"
             )
         if name in RESERVED_LIGHT_NAMES:
             raise SceneError(

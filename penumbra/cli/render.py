@@ -49,5 +49,6 @@ def render(
     with context.ensure_object(Console).progress() as progress:
         library_render(scene, output, process_limit=True, progress=progress, **settings)
     for path in (output, settings["preview"], settings["stats"]):
-        if path is not None:
+        # A finished image that was resumed comes without new numbers.
+        if path is not None and Path(path).exists():
             result(path)

@@ -7,6 +7,9 @@ from typing import TypeVar
 
 from penumbra.errors import SceneError
 
+# More gain nothing anywhere, and systems refuse to start thousands.
+_MOST_THREADS = 1024
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -19,7 +22,7 @@ def resolve_threads(threads: int) -> int:
     if threads < 0:
         raise SceneError(f"threads is {threads}: use 0 for all cores, or a positive number")
     if threads:
-        return threads
+        return min(threads, _MOST_THREADS)
     # The affinity mask and not cpu_count: under SLURM or `taskset` the machine has more than we may use.
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

@@ -6,6 +6,7 @@ of all kernel sources: a changed kernel starts from an empty folder instead of r
 
 import hashlib
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,27 @@ def _sources_hash() -> str:
 
 
 def cache_folder() -> Path:
-    """Folder of the compiled kernels, one per source hash: in NUMBA_CACHE_DIR, or in the user's cache."""
-    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "penumbra" / f"numba{numba.__version__}-{_sources_hash()}"
+    """Folder of the compiled kernels, one per source hash: in NUMBA_CACHE_DIR, or in the user's cache.
+
+    Where neither can be written (a container without a home), it is in the folder for temporary files:
+    numba would otherwise refuse to compile, or keep stale code beside the sources.
+    """
+    version = f"numba{numba.__version__}-{_sources_hash()}"
+    asked = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
+    home = Path(asked) if asked else Path(os.path.expanduser("~")) / ".cache"
+    folder = home / "penumbra" / version
+    if _can_be_written(folder):
+        return folder
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    return Path(tempfile.gettempdir()) / f"penumbra-{user}" / version
+
+
+def _can_be_written(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK)
 
 
 # numba reads this setting at every compilation, so assigning it before the first decorator suffices.
