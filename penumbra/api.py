@@ -211,7 +211,7 @@ def _checked(values: Any, what: str, shape: tuple[int | None, ...]) -> Float64Ar
         return np.zeros((0, *(size or 0 for size in shape[1:])))
     if array.ndim != len(shape) or any(s not in (None, n) for s, n in zip(shape, array.shape, strict=True)):
         raise SceneError(f"{what} has shape {array.shape}: give an array of shape {wanted}")
-    bad = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
     if len(bad):
         raise SceneError(f"{what} row {bad[0]} is not finite: {array[bad[0]].tolist()}")
     return array

@@ -53,7 +53,8 @@ class RectLight:
         keep("name", str(name))
         for field, vector in (("corner", corner), ("edge_u", edge_u), ("edge_v", edge_v)):
             keep(field, _vector(vector, f"{field} of light '{name}'"))
-        reach = np.abs(self.corner) + np.abs(self.edge_u) + np.abs(self.edge_v)
+        with np.errstate(over="ignore"):
+            reach = np.abs(self.corner) + np.abs(self.edge_u) + np.abs(self.edge_v)
         if not np.isfinite(reach).all():
             raise SceneError(f"light '{name}' reaches beyond the largest number: make it smaller")
         whole = (

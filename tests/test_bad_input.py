@@ -29,6 +29,9 @@ BAD_INPUT = {
     ),
     "blockers of two corners": ({"blockers": np.zeros((4, 2, 3))}, r"blockers has shape \(4, 2, 3\)"),
     "keep what there is not": ({"keep": "bits"}, "keep is 'bits'"),
+    "complex points": ({"points": np.zeros((2, 3)) * 1j}, "points cannot be read"),
+    "points with no coordinates": ({"points": np.zeros((5, 0))}, r"points has shape \(5, 0\)"),
+    "own beyond an int64": ({"own": np.array([2**64 - 1], np.uint64)}, "own row 0 "),
     "memory that is not a size": ({"memory": "much"}, "is not a size"),
 }
 
@@ -50,7 +53,14 @@ def test_a_backend_that_there_is_not() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"corner": (0, np.nan, 0)}, {"edge_u": (np.inf, 0, 0)}, {"edge_v": (1, 2)}, {"samples": 0}, {"sets": 0}],
+    [
+        {"corner": (0, np.nan, 0)},
+        {"edge_u": (np.inf, 0, 0)},
+        {"edge_v": (1, 2)},
+        {"samples": 0},
+        {"sets": 0},
+        {"seed": 2**70},
+    ],
     ids=str,
 )
 def test_lights_that_are_not_finite_are_refused(change: dict[str, Any]) -> None:
@@ -68,3 +78,10 @@ def test_lights_of_any_size_have_samples_or_are_refused(exponent: int) -> None:
         return
     assert (samples[..., :2] >= 0.0).all()
     assert (samples[..., :2] <= edge).all()
+
+
+def test_a_light_that_is_none_and_one_beyond_all_numbers() -> None:
+    with pytest.raises(SceneError, match="light is None"):
+        penumbra.cast(np.zeros((1, 3)), np.zeros((0, 3, 3)), None)  # type: ignore[arg-type]
+    with pytest.raises(SceneError, match="light 'light' reaches beyond"):
+        RectLight((1e308, 3, 0), (1e308, 0, 0), (0, 0, 1))

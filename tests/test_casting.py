@@ -265,3 +265,11 @@ def test_kernel_cache_changes_with_the_kernels_wherever_it_is(monkeypatch, tmp_p
     assert before.is_relative_to(tmp_path)
     monkeypatch.setattr(_jit, "_sources_hash", lambda: "another")
     assert _jit.cache_folder() != before
+
+
+def test_kernel_cache_falls_back_where_its_folder_cannot_be_made(monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    folder = _jit.cache_folder()
+    assert folder.is_relative_to(tmp_path) and not folder.is_relative_to(tmp_path / "file")

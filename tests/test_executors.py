@@ -80,6 +80,7 @@ def test_ctrl_c_stops_at_the_next_item(threads):
 
 def test_resolve_threads():
     assert resolve_threads(3) == 3
+    assert resolve_threads(100_000) <= 1024
     assert resolve_threads(0) == len(os.sched_getaffinity(0))
     with pytest.raises(ValueError, match="threads is -1"):
         resolve_threads(-1)

@@ -102,7 +102,8 @@ def test_memory_of_this_process():
 
 def test_call_limit():
     assert call_limit_bytes(1000, process_limit=False) == 1000
-    assert call_limit_bytes(1, process_limit=True) == 0
+    # The process is above that limit already.
+    assert call_limit_bytes(1, process_limit=True) < 0
     gib = 1 << 30
     assert gib - 2 * resident_bytes() < call_limit_bytes(gib, process_limit=True) < gib
     assert call_limit_bytes(None, process_limit=False) == pytest.approx(available_bytes() / 2, rel=0.2)

@@ -124,6 +124,12 @@ def test_reserved_light_names(name: str, scene_file: Path) -> None:
     _refused(scene_file, [":11:", f"'{name}'", "reserved"])
 
 
+@pytest.mark.parametrize("name", ["k" * 201, "a\\u0000b", "a\\nb"])
+def test_light_names_that_cannot_name_a_layer(name: str, scene_file: Path) -> None:
+    scene_file.write_text(scene_file.read_text().replace('"key"', f'"{name}"'))
+    _refused(scene_file, [":11:", "too long or has characters that do not print"])
+
+
 def test_names_must_differ(scene_file: Path) -> None:
     scene_file.write_text(scene_file.read_text() + LIGHT.replace("fill", "key"))
     _refused(scene_file, [":19:", "'key'", "two lights"])
