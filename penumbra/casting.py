@@ -15,11 +15,10 @@ from penumbra.arrays import (
 )
 from penumbra.blockers import Blockers, prefetch
 from penumbra.executors.threads import run_tasks
-from penumbra.facing import face_light, full_mask, words_of
+from penumbra.facing import CastStart, face_light, full_mask
 from penumbra.kernels.casting import DONE, POOL_EMPTY, cast_blockers
 from penumbra.kernels.counters import N_COUNTERS, NAMES
-from penumbra.kernels.facing import FACES_NONE
-from penumbra.lights import RectLight, sample_sets_of
+from penumbra.lights import RectLight
 from penumbra.options import CastOptions
 from penumbra.progress import Progress
 from penumbra.receivers import ReceiverTile, split_into_tiles
@@ -44,43 +43,30 @@ def cast_receivers(
     """
     stats = Stats("hpc")
     with stats.timed("hierarchy"):
-        samples = light.light_samples(options.group_size)
-        sample_sets = sample_sets_of(receivers.index, light.seed, light.sets)
-        facing = face_light(receivers, samples, sample_sets, light.samples, not light.two_sided)
-        masks = np.zeros((len(receivers.points), words_of(light.samples)), np.uint64)
-        masks[facing.state == FACES_NONE] = full_mask(light.samples)
-        masks[facing.rows] = facing.masks
-        live = np.flatnonzero(facing.state != FACES_NONE)
+        start = face_light(receivers, light, options.group_size)
         extent = float(np.abs(blockers.bounds).max()) if blockers.n_triangles else 0.0
-        tiles = _make_tiles(receivers, live, sample_sets, masks, samples, extent, options, threads)
+        tiles = _make_tiles(receivers, start, extent, options, threads)
     with stats.timed("cast"):
-        counters = _cast_chunks(tiles, blockers, samples, options, threads, progress, stats)
+        counters = _cast_chunks(tiles, blockers, start.samples, options, threads, progress, stats)
     for tile in tiles:
-        tile.copy_masks(masks)
-    _count(stats, counters, tiles, len(receivers.points) - len(live))
-    return masks, sample_sets, stats
+        tile.copy_masks(start.masks)
+    _count(stats, counters, tiles, len(receivers.points) - len(start.live))
+    return start.masks, start.sample_sets, stats
 
 
 def _make_tiles(
-    receivers: Receivers,
-    live: np.ndarray,
-    sample_sets: UInt8Array,
-    masks: UInt64Array,
-    samples: LightSamples,
-    blocker_extent: float,
-    options: CastOptions,
-    threads: int,
+    receivers: Receivers, start: CastStart, blocker_extent: float, options: CastOptions, threads: int
 ) -> list[ReceiverTile]:
     """Tiles of the receivers that face the light, with their hierarchies built."""
-    partial = np.asarray(masks.any(axis=1))
-    full = full_mask(samples.n_samples)
+    partial = np.asarray(start.masks.any(axis=1))
+    full = full_mask(start.samples.n_samples)
 
     def make(rows: np.ndarray) -> ReceiverTile:
         tile = ReceiverTile(
             rows,
             receivers,
-            sample_sets,
-            samples,
+            start.sample_sets,
+            start.samples,
             full,
             blocker_extent=blocker_extent,
             group_size=options.group_size,
@@ -88,11 +74,11 @@ def _make_tiles(
             lazy_masks=options.lazy_masks,
         )
         started = np.flatnonzero(partial[rows])
-        tile.set_masks(started, masks[rows[started]])
+        tile.set_masks(started, start.masks[rows[started]])
         tile.build()
         return tile
 
-    return run_tasks(make, split_into_tiles(receivers.points, live, options.tile_receivers), threads)
+    return run_tasks(make, split_into_tiles(receivers.points, start.live, options.tile_receivers), threads)
 
 
 def _cast_chunks(

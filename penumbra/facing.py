@@ -6,19 +6,16 @@ import numpy as np
 
 from penumbra.arrays import Int64Array, LightSamples, Receivers, UInt8Array, UInt64Array
 from penumbra.kernels.facing import FACES_NONE, FACES_SOME, classify_facing, fill_not_facing
+from penumbra.lights import RectLight, sample_sets_of
 
 
-class Facing(NamedTuple):
-    """State of R receivers before any blocker."""
+class CastStart(NamedTuple):
+    """What every backend starts from: a light's samples, and R receivers before any blocker."""
 
-    state: UInt8Array  # (R,) FACES_ALL, FACES_SOME or FACES_NONE
-    rows: Int64Array  # (n,) the receivers that face some samples only
-    masks: UInt64Array  # (n, n_words) their bits of the samples that they do not face
-
-
-def words_of(n_samples: int) -> int:
-    """Words of a mask of n_samples bits."""
-    return -(-n_samples // 64)
+    samples: LightSamples
+    sample_sets: UInt8Array  # (R,)
+    masks: UInt64Array  # (R, n_words) with the bits of the samples that are not faced
+    live: Int64Array  # the rows that face some sample; the others are not cast
 
 
 def full_mask(n_samples: int) -> UInt64Array:
@@ -27,25 +24,18 @@ def full_mask(n_samples: int) -> UInt64Array:
     return np.array(ones, dtype=np.uint64)
 
 
-def face_light(
-    receivers: Receivers, light: LightSamples, sample_sets: UInt8Array, n_samples: int, single_sided: bool
-) -> Facing:
-    """Class every receiver by exact signs, and fill the masks of those that face some samples only."""
+def face_light(receivers: Receivers, light: RectLight, group_size: int) -> CastStart:
+    """Choose the receivers' sample sets, and decide by exact signs what they do not face."""
+    samples = light.light_samples(group_size)
+    sample_sets = sample_sets_of(receivers.index, light.seed, light.sets)
+    full = full_mask(light.samples)
     state = np.empty(len(receivers.points), np.uint8)
-    classify_facing(receivers.points, receivers.normals, light, single_sided, state)
-    rows = np.flatnonzero(state == FACES_SOME).astype(np.int64)
-    masks = np.zeros((len(rows), words_of(n_samples)), np.uint64)
-    fill_not_facing(rows, receivers.points, receivers.normals, sample_sets, light, n_samples, masks)
-    full = (masks == full_mask(n_samples)).all(axis=1)
-    state[rows[full]] = FACES_NONE
-    clear = ~masks.any(axis=1)
-    keep = ~(full | clear)
-    return Facing(state, rows[keep], masks[keep])
-
-
-def masks_before_casting(facing: Facing, n_samples: int) -> UInt64Array:
-    """(R, n_words) masks with the bits of the samples that are not faced."""
-    masks = np.zeros((len(facing.state), words_of(n_samples)), np.uint64)
-    masks[facing.rows] = facing.masks
-    masks[facing.state == FACES_NONE] = full_mask(n_samples)
-    return masks
+    classify_facing(receivers.points, receivers.normals, samples, not light.two_sided, state)
+    some = np.flatnonzero(state == FACES_SOME).astype(np.int64)
+    part = np.zeros((len(some), len(full)), np.uint64)
+    fill_not_facing(some, receivers.points, receivers.normals, sample_sets, samples, light.samples, part)
+    masks = np.zeros((len(state), len(full)), np.uint64)
+    masks[some] = part
+    state[some[(part == full).all(axis=1)]] = FACES_NONE
+    masks[state == FACES_NONE] = full
+    return CastStart(samples, sample_sets, masks, np.flatnonzero(state != FACES_NONE).astype(np.int64))

@@ -5,16 +5,14 @@ import numpy as np
 from penumbra.arrays import Receivers, UInt8Array, UInt64Array
 from penumbra.blockers import Blockers, prefetch
 from penumbra.executors.threads import run_tasks
-from penumbra.facing import face_light, masks_before_casting
+from penumbra.facing import face_light
 from penumbra.kernels.counters import N_COUNTERS, NAMES
-from penumbra.kernels.facing import FACES_NONE
 from penumbra.kernels.reference import cast_reference
-from penumbra.lights import RectLight, sample_sets_of
+from penumbra.lights import RectLight
 from penumbra.options import CastOptions
 from penumbra.progress import Progress
 from penumbra.stats import Stats
 
-_GROUP_SIZE = 32
 _SLICE_RECEIVERS = 4096
 
 
@@ -33,11 +31,7 @@ def cast_receivers(
     """
     stats = Stats("reference")
     with stats.timed("hierarchy"):
-        samples = light.light_samples(_GROUP_SIZE)
-        sample_sets = sample_sets_of(receivers.index, light.seed, light.sets)
-        facing = face_light(receivers, samples, sample_sets, light.samples, not light.two_sided)
-        masks = masks_before_casting(facing, light.samples)
-        live = np.flatnonzero(facing.state != FACES_NONE).astype(np.int64)
+        samples, sample_sets, masks, live = face_light(receivers, light, options.group_size)
     slices = [live[first : first + _SLICE_RECEIVERS] for first in range(0, len(live), _SLICE_RECEIVERS)]
     progress.stage("cast", blockers.n_triangles, "triangles")
     with stats.timed("cast"):
