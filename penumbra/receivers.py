@@ -58,7 +58,7 @@ class ReceiverTile:
         self.pool = _new_pool(len(rows), full, _FIRST_MASKS if lazy_masks else len(rows))
         if not lazy_masks:
             self._give_masks(np.arange(len(rows)))
-        self.shaft = _shaft(self._points, light, blocker_extent)
+        self._blocker_extent = blocker_extent
 
     def set_masks(self, tile_rows: Int64Array, masks: UInt64Array) -> None:
         """Start some receivers of the tile with bits set: the samples they do not face."""
@@ -69,11 +69,12 @@ class ReceiverTile:
         self.pool.masks[self.pool.place[tile_rows]] = masks
 
     def build(self) -> None:
-        """Build the hierarchy over the receivers that are not in full umbra."""
+        """Build hierarchy and shaft over the receivers that are not in full umbra."""
         order = np.flatnonzero(self.pool.place != MASK_UMBRA).astype(np.int32)
         n_groups = len(self._light.full_groups)
         if len(order):
             boxes, first, count, child, self.depth = _build(self._points, order, self._leaf_receivers)
+            self.shaft = _shaft(boxes[0], self._light, self._blocker_extent)
         else:
             boxes, first, count, child, self.depth = np.zeros((0, 6)), *np.zeros((3, 0), np.int32), 0
         self.bvh = ReceiverBvh(
@@ -174,10 +175,9 @@ def _build(
     )
 
 
-def _shaft(points: Float64Array, light: LightSamples, blocker_extent: float) -> Shaft:
+def _shaft(tile_box: Float64Array, light: LightSamples, blocker_extent: float) -> Shaft:
     corners = light.corners[0]
     margin = 4.0 * light.residual
-    tile_box = np.concatenate([points.min(axis=0), points.max(axis=0)])
     light_box = np.concatenate([corners.min(axis=0) - margin, corners.max(axis=0) + margin])
     extent = float(max(np.abs(tile_box).max(), np.abs(light_box).max()))
     box, planes = np.empty(6), np.empty((N_SHAFT_PLANES, 4))

@@ -126,6 +126,7 @@ def test_shaft_keeps_every_box_that_a_segment_meets(rng):
         np.arange(50), receivers, sets, light.light_samples(32), full_mask(16),
         blocker_extent=10.0, group_size=32, leaf_receivers=16, lazy_masks=True,
     )  # fmt: skip
+    tile.build()
     ends = light.sample_points[rng.integers(0, 8, 50), rng.integers(0, 16, 50)]
     on_way = points + rng.random((50, 1)) * (ends - points)
     boxes = np.stack([on_way - 1e-3 * rng.random((50, 3)), on_way], axis=1)
