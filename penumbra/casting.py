@@ -62,6 +62,7 @@ def _make_tiles(
     full = full_mask(start.samples.n_samples)
 
     def make(rows: np.ndarray) -> ReceiverTile:
+        """One tile, started with the bits that its receivers do not face."""
         tile = ReceiverTile(
             rows,
             receivers,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from penumbra.arrays import Receivers, UInt8Array, UInt64Array
+from penumbra.arrays import BlockerChunk, Receivers, UInt8Array, UInt64Array
 from penumbra.blockers import Blockers, prefetch
 from penumbra.executors.threads import run_tasks
 from penumbra.facing import face_light
@@ -27,7 +27,8 @@ def cast_receivers(
 ) -> tuple[UInt64Array, UInt8Array, Stats]:
     """Masks uint64 (R, n_words), sample sets uint8 (R,) and Stats, by testing every pair.
 
-    Takes R * T * K steps: some 10^10 a minute. The options switch nothing here.
+    Takes R * T * K steps: some 4 * 10^9 a minute on one core. Only `group_size` of the options matters,
+    and changes nothing that is returned.
     """
     stats = Stats("reference")
     with stats.timed("hierarchy"):
@@ -38,7 +39,8 @@ def cast_receivers(
         for number, chunk in prefetch(blockers, range(len(blockers.chunks)) if slices else ()):
             stats.count("bytes_read", blockers.chunks[number].n_bytes)
 
-            def cast_slice(rows: np.ndarray, chunk=chunk) -> np.ndarray:  # type: ignore[no-untyped-def]
+            def cast_slice(rows: np.ndarray, chunk: BlockerChunk = chunk) -> np.ndarray:
+                """Cast the chunk on some rows of the masks; the counters (N_COUNTERS,)."""
                 counters = np.zeros(N_COUNTERS, np.int64)
                 cast_reference(
                     receivers.points,
