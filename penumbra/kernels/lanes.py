@@ -1,8 +1,9 @@
 """Vectors of lanes: 16 float32 or 8 float64, as LLVM vectors under JIT and numpy arrays without.
 
 Explicit vectors do not depend on what the auto-vectoriser sees in a loop, and LLVM lowers them on any
-processor: a group of 32 samples against a blocker takes 5 ns, eight planes against a box 2 ns. One source serves both modes: load and splat
-make vectors, + - * work on them, lesser and greater pick by lane, bits_above packs a comparison.
+processor: a group of 32 samples against a blocker takes 5 ns, eight planes against a box 2 ns. One
+source serves both modes: load and splat make vectors, + - * work on them, lesser and greater pick by
+lane, bits_above packs a comparison.
 """
 
 import operator
