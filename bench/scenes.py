@@ -1,5 +1,6 @@
 """Scenes of the benchmarks: real meshes taken by path, with a camera and a light for each."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,9 @@ SCENES = {
 def write_scene(
     name: str, folder: Path, meshes: Path = FOLDER, samples: int = 256, sets: int = 8
 ) -> Path | None:
-    """Write a scene file (and a floor where the scene wants one); None if the mesh is not there."""
+    """Write the scene file of a name in SCENES, or of a path NAME.json; None if the mesh is not there."""
+    if name.endswith(".json"):
+        return _from_json(Path(name), folder, samples, sets)
     mesh, up, floor, eye, look_at, vfov, corner, edge_u, edge_v = SCENES[name]
     if not (meshes / mesh).exists():
         return None
@@ -41,15 +44,25 @@ def write_scene(
         text = "".join("v {:.9g} {:.9g} {:.9g}\n".format(*c) for c in corners)
         (folder / f"{name}-floor.obj").write_text(text + "f 1 2 3 4\n")
         lines += ["[[geometry]]", f'path = "{name}-floor.obj"']
-    lines += [
-        "[camera]",
-        f"eye = {eye}",
-        f"look_at = {look_at}",
-        f"vfov = {vfov}",
-        "resolution = [1280, 960]",
-    ]
-    lines += ["[[light]]", 'name = "key"', 'type = "rect"', f"corner = {corner}", f"edge_u = {edge_u}"]
-    lines += [f"edge_v = {edge_v}", f"samples = {samples}", f"sets = {sets}", "radiance = 10.0"]
-    path = folder / f"{name}.toml"
+    view = {"eye": eye, "look_at": look_at, "vfov": vfov}
+    lamp = {"corner": corner, "edge_u": edge_u, "edge_v": edge_v, "samples": samples, "sets": sets}
+    return _write(folder / f"{name}.toml", lines, view, lamp)
+
+
+def _from_json(path: Path, folder: Path, samples: int, sets: int) -> Path:
+    """Scene file of a scene that is described as JSON: mesh, camera and light, as a path NAME.json."""
+    given = json.loads(path.read_text())
+    view = {"eye": given["camera"]["eye"], "look_at": given["camera"]["look_at"]}
+    view |= {"up": given["camera"]["up"], "vfov": given["camera"]["vfov_deg"]}
+    lamp = given["light"] | {"samples": samples, "sets": sets}
+    lines = ["[[geometry]]", f'path = "{path.parent.resolve() / given["mesh"]}"']
+    return _write(folder / f"{path.stem}.toml", lines, view, lamp)
+
+
+def _write(path: Path, lines: list[str], view: dict, lamp: dict) -> Path:  # type: ignore[type-arg]
+    """Write geometry lines, camera and light as a scene file."""
+    lines = lines + ["[camera]", *(f"{key} = {value}" for key, value in view.items())]
+    lines += ["resolution = [1280, 960]", "[[light]]", 'name = "key"', 'type = "rect"', "radiance = 10.0"]
+    lines += [f"{key} = {value}" for key, value in lamp.items()]
     path.write_text("\n".join(lines) + "\n")
     return path

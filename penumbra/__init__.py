@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from penumbra.api import camera_receivers, cast
     from penumbra.ingest import ingest
     from penumbra.io.blocker_store import open_store
-    from penumbra.lights import RectLight
+    from penumbra.lights import PointLight, RectLight
     from penumbra.options import CastOptions, IngestOptions
     from penumbra.render import render
     from penumbra.scene import Camera, MeshRef, Scene
@@ -27,6 +27,7 @@ __all__ = [
     "CastOptions",
     "IngestOptions",
     "MeshRef",
+    "PointLight",
     "RectLight",
     "Scene",
     "__version__",
@@ -43,6 +44,7 @@ _HOME = {
     "CastOptions": "penumbra.options",
     "IngestOptions": "penumbra.options",
     "MeshRef": "penumbra.scene",
+    "PointLight": "penumbra.lights",
     "RectLight": "penumbra.lights",
     "Scene": "penumbra.scene",
     "camera_receivers": "penumbra.api",

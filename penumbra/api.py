@@ -11,10 +11,10 @@ from penumbra.arrays import Float32Array, Float64Array, Int64Array, Receivers, U
 from penumbra.blockers import Blockers
 from penumbra.errors import BackendError, SceneError
 from penumbra.executors.threads import resolve_threads
-from penumbra.lights import RectLight
+from penumbra.lights import Light, PointLight, RectLight
 from penumbra.memory import call_limit_bytes
 from penumbra.options import CastOptions, IngestOptions, parse_size
-from penumbra.plan import array_bytes, receivers_per_pass
+from penumbra.plan import array_bytes, backend_bytes, fitted_options, receivers_per_pass
 from penumbra.progress import NullProgress, Progress
 from penumbra.scene import Scene
 from penumbra.stats import Stats
@@ -37,7 +37,7 @@ class CastResult:
 def cast(
     points: Float64Array,
     blockers: Any,
-    light: RectLight,
+    light: Light,
     *,
     normals: Float64Array | None = None,
     own: Int64Array | None = None,
@@ -62,8 +62,8 @@ def cast(
     result cannot fit, BackendError for an unknown backend.
     """
     options = options or CastOptions()
-    if not isinstance(light, RectLight):
-        raise SceneError(f"light is {light!r}: give a penumbra.RectLight")
+    if not isinstance(light, RectLight | PointLight):
+        raise SceneError(f"light is {light!r}: give a penumbra.RectLight or a penumbra.PointLight")
     receivers = _checked_receivers(points, normals, own, index)
     if keep not in ("masks", "visibility"):
         raise SceneError(f"keep is {keep!r}: give 'masks' or 'visibility'")
@@ -72,8 +72,10 @@ def cast(
     with ExitStack() as stack:
         if not isinstance(given, np.ndarray) and given is not blockers:
             stack.callback(given.close)
+        options = fitted_options(options, limit)
+        held = _blocker_bytes(given) + backend_bytes(backend, options, _chunk_triangles(given))
         per_pass = receivers_per_pass(
-            len(receivers.points), light.samples, light.sets, _blocker_bytes(given), keep == "masks", limit
+            len(receivers.points), light.samples, light.sets, held, keep == "masks", limit
         )
         if isinstance(given, np.ndarray):
             from penumbra.ingest import blockers_in_memory
@@ -115,7 +117,11 @@ def backend_named(name: str) -> Any:
         from penumbra import reference
 
         return reference.cast_receivers
-    raise BackendError(f"there is no backend {name!r}: use hpc, reference or auto")
+    if name == "gears":
+        from penumbra import gears
+
+        return gears.cast_receivers
+    raise BackendError(f"there is no backend {name!r}: use hpc, gears, reference or auto")
 
 
 def visible_fraction(masks: UInt64Array, n_samples: int) -> Float32Array:
@@ -128,7 +134,7 @@ def visible_fraction(masks: UInt64Array, n_samples: int) -> Float32Array:
 def _cast_in_passes(
     receivers: Receivers,
     blockers: Blockers,
-    light: RectLight,
+    light: Light,
     per_pass: int,
     keep: str,
     backend: str,
@@ -174,6 +180,13 @@ def _blocker_bytes(blockers: Blockers | Float64Array) -> int:
         return array_bytes(len(blockers))
     # Two chunks at a time, each as it is read and as float64.
     return 4 * max((chunk.n_bytes for chunk in blockers.chunks), default=0)
+
+
+def _chunk_triangles(blockers: Blockers | Float64Array) -> int:
+    """Triangles of the largest chunk there is or will be."""
+    if isinstance(blockers, np.ndarray):
+        return min(len(blockers), IngestOptions().chunk_triangles)
+    return max((chunk.count for chunk in blockers.chunks), default=0)
 
 
 def _checked_receivers(points: Any, normals: Any, own: Any, index: Any) -> Receivers:

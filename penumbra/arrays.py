@@ -128,6 +128,13 @@ class CastScratch(NamedTuple):
     edges: Float32Array  # (4, 4) edge functions over the light: A, B, C, bound
 
 
+class PointScratch(NamedTuple):
+    """Working memory of one casting task of a point light; D levels."""
+
+    stack: Int32Array  # (2 * D + 2, 2) node and its active planes to visit; node < 0: ~node is to be left
+    volume: Float64Array  # (5, 8) hard shadow volume: rows nx, ny, nz, d, and the bound of their rounding
+
+
 class Shaft(NamedTuple):
     """All segments between a tile's receivers and the light lie inside: what can be culled at once."""
 
@@ -145,6 +152,53 @@ class Blocker(NamedTuple):
     side: int  # side of its plane on which the whole light lies for certain, or 0
     extent: float  # largest coordinate of blocker, tile and light
     amplify: float  # reach of a shadow over the gap to the light; inf: they may touch
+
+
+class GridCamera(NamedTuple):
+    """Camera C of GEARS section 3.1, in the frame of a light: z is the depth below the light."""
+
+    axes: Float64Array  # (3, 3) rows x, y, z: coordinates are axes . (p - origin), within `error`
+    origin: Float64Array  # (3,) world space
+    eye: Float64Array  # (3,) in the frame, behind the light
+    light: Float64Array  # (6,) box of all light samples in the frame, min and max, padded by `error`
+    error: float  # largest rounding of a coordinate, of any point that is given to the camera
+
+
+class ReceiverGrid(NamedTuple):
+    """Receivers binned to cells of the image plane; nx * ny cells, and a last one for the others."""
+
+    lines_x: Float64Array  # (nx + 1,) cell boundaries in the image plane, ascending
+    lines_y: Float64Array  # (ny + 1,)
+    far: Float64Array  # (n_cells,) depth of the farthest receiver of a cell, -inf where there is none
+    first: Int64Array  # (n_cells + 2,) where a cell's run of `rows` begins; the last run is of receivers
+    rows: Int64Array  # (n,) outside the image, which every blocker is tested against
+    box: Float64Array  # (6,) bounds of light and receivers in the frame, padded
+    depth: float  # depth of the farthest receiver of the grid
+    nearest: float  # least distance of a receiver of the image from the plane through the eye
+    slack: float  # largest error of a receiver's place in the image plane
+
+
+class Raster(NamedTuple):
+    """What is rasterised onto: R receivers and their masks, for all blockers alike."""
+
+    points: Float64Array  # (R, 3)
+    own: Int64Array  # (R,) triangle each lies on
+    sample_sets: UInt8Array  # (R,)
+    masks: UInt64Array  # (R, n_words) blocked samples
+    full: UInt64Array  # (n_words,) mask with every sample blocked
+    group_boxes: Float32Array  # (4, n) centres s, t and half widths of the groups, n a multiple of 16
+    group_size: int
+    extent: float  # largest coordinate of receivers, blockers and light
+    skip_blocked: bool  # pass over what is blocked already
+
+
+class RasterScratch(NamedTuple):
+    """Working memory of one rasterising task."""
+
+    lanes: Float64Array  # (N_ROWS, BLOCK) blockers of a cell, set up
+    found: Float64Array  # (3, 4, N_LANES) edge functions of eight blockers: A, B, C, bound
+    edges: Float32Array  # (4, 4) edge functions of the blocker in hand
+    normal: Float64Array  # (6,) its normal and the permanents
 
 
 class CastSwitches(NamedTuple):

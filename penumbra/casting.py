@@ -1,6 +1,6 @@
 """6: backend "hpc", hierarchical penumbra casting (Laine & Aila 2005, section 3)."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from penumbra.arrays import (
     CastScratch,
     CastSwitches,
     LightSamples,
+    PointScratch,
     Receivers,
     UInt8Array,
     UInt64Array,
@@ -16,9 +17,10 @@ from penumbra.arrays import (
 from penumbra.blockers import Blockers, prefetch
 from penumbra.executors.threads import run_tasks
 from penumbra.facing import CastStart, face_light, full_mask
-from penumbra.kernels.casting import DONE, POOL_EMPTY, cast_blockers
+from penumbra.kernels.casting import DONE, POOL_EMPTY, REBUILD, cast_blockers
 from penumbra.kernels.counters import N_COUNTERS, NAMES
-from penumbra.lights import RectLight
+from penumbra.kernels.point_casting import cast_blockers_from_point
+from penumbra.lights import Light, PointLight
 from penumbra.options import CastOptions
 from penumbra.progress import Progress
 from penumbra.receivers import ReceiverTile, split_into_tiles
@@ -26,11 +28,13 @@ from penumbra.stats import Stats
 
 _NEVER = 2**62
 
+CastTile = Callable[[ReceiverTile, BlockerChunk, LightSamples, CastOptions, np.ndarray], None]
+
 
 def cast_receivers(
     receivers: Receivers,
     blockers: Blockers,
-    light: RectLight,
+    light: Light,
     *,
     options: CastOptions,
     threads: int,
@@ -45,9 +49,11 @@ def cast_receivers(
     with stats.timed("hierarchy"):
         start = face_light(receivers, light, options.group_size)
         extent = float(np.abs(blockers.bounds).max()) if blockers.n_triangles else 0.0
-        tiles = _make_tiles(receivers, start, extent, options, threads)
+        is_point = isinstance(light, PointLight)
+        tiles = _make_tiles(receivers, start, extent, options, threads, has_masks=not is_point)
     with stats.timed("cast"):
-        counters = _cast_chunks(tiles, blockers, start.samples, options, threads, progress, stats)
+        cast_tile = _cast_tile_from_point if is_point else _cast_tile
+        counters = _cast_chunks(tiles, blockers, start.samples, cast_tile, options, threads, progress, stats)
     for tile in tiles:
         tile.copy_masks(start.masks)
     _count(stats, counters, tiles, len(receivers.points) - len(start.live))
@@ -55,7 +61,13 @@ def cast_receivers(
 
 
 def _make_tiles(
-    receivers: Receivers, start: CastStart, blocker_extent: float, options: CastOptions, threads: int
+    receivers: Receivers,
+    start: CastStart,
+    blocker_extent: float,
+    options: CastOptions,
+    threads: int,
+    *,
+    has_masks: bool,
 ) -> list[ReceiverTile]:
     """Tiles of the receivers that face the light, with their hierarchies built."""
     partial = np.asarray(start.masks.any(axis=1))
@@ -73,6 +85,7 @@ def _make_tiles(
             group_size=options.group_size,
             leaf_receivers=options.leaf_receivers,
             lazy_masks=options.lazy_masks,
+            has_masks=has_masks,
         )
         started = np.flatnonzero(partial[rows])
         tile.set_masks(started, start.masks[rows[started]])
@@ -86,6 +99,7 @@ def _cast_chunks(
     tiles: list[ReceiverTile],
     blockers: Blockers,
     samples: LightSamples,
+    cast_tile: CastTile,
     options: CastOptions,
     threads: int,
     progress: Progress,
@@ -112,10 +126,10 @@ def _cast_chunks(
     for number, chunk in prefetch(blockers, wanted()):
         work = [k for k, tile in enumerate(tiles) if touches[k, number] and tile.n_live]
 
-        def cast_tile(k: int, chunk: BlockerChunk = chunk) -> None:
-            _cast_tile(tiles[k], chunk, samples, options, counters[k])
+        def task(k: int, chunk: BlockerChunk = chunk) -> None:
+            cast_tile(tiles[k], chunk, samples, options, counters[k])
 
-        run_tasks(cast_tile, work, threads)
+        run_tasks(task, work, threads)
         progress.advance(len(chunk.ids))
     return counters
 
@@ -124,19 +138,14 @@ def _cast_tile(
     tile: ReceiverTile, chunk: BlockerChunk, samples: LightSamples, options: CastOptions, counters: np.ndarray
 ) -> None:
     """Cast a chunk on a tile; between blockers, grow its mask pool and rebuild its hierarchy as needed."""
-    switches = CastSwitches(
-        options.umbra_bits, options.active_planes, options.lazy_volumes, options.lazy_masks
-    )
+    switches = _switches(options)
     start, reason = 0, POOL_EMPTY
     while reason != DONE and tile.n_live:
         scratch = _scratch(tile.depth, len(samples.full_groups))
-        rebuild_at = max(1, int(options.rebuild_fraction * tile.n_live)) if options.umbra_bits else _NEVER
-        if options.rebuild_fraction >= 1:
-            rebuild_at = _NEVER
         start, reason = cast_blockers(
             chunk,
             start,
-            rebuild_at,
+            _rebuild_at(tile, options),
             tile.shaft,
             tile.bvh,
             tile.pool,
@@ -151,6 +160,41 @@ def _cast_tile(
             tile.refresh_umbra()
         elif reason != DONE:
             tile.rebuild()
+
+
+def _cast_tile_from_point(
+    tile: ReceiverTile, chunk: BlockerChunk, samples: LightSamples, options: CastOptions, counters: np.ndarray
+) -> None:
+    """Cast a chunk on a tile of a point light; between blockers, rebuild its hierarchy as needed."""
+    switches = _switches(options)
+    start, reason = 0, REBUILD
+    while reason != DONE and tile.n_live:
+        scratch = PointScratch(np.empty((2 * tile.depth + 6, 2), np.int32), np.zeros((5, 8)))
+        start, reason = cast_blockers_from_point(
+            chunk,
+            start,
+            _rebuild_at(tile, options),
+            tile.shaft,
+            tile.bvh,
+            tile.pool,
+            samples,
+            switches,
+            scratch,
+            counters,
+        )
+        if reason == REBUILD:
+            tile.rebuild()
+
+
+def _switches(options: CastOptions) -> CastSwitches:
+    return CastSwitches(options.umbra_bits, options.active_planes, options.lazy_volumes, options.lazy_masks)
+
+
+def _rebuild_at(tile: ReceiverTile, options: CastOptions) -> int:
+    """How many receivers must reach full umbra for the tile's hierarchy to be built again."""
+    if not options.umbra_bits or options.rebuild_fraction >= 1:
+        return _NEVER
+    return max(1, int(options.rebuild_fraction * tile.n_live))
 
 
 def _scratch(depth: int, n_groups: int) -> CastScratch:

@@ -6,7 +6,7 @@ import numpy as np
 
 from penumbra.arrays import Int64Array, LightSamples, Receivers, UInt8Array, UInt64Array
 from penumbra.kernels.facing import FACES_NONE, FACES_SOME, classify_facing, fill_not_facing
-from penumbra.lights import RectLight, sample_sets_of
+from penumbra.lights import Light, sample_sets_of
 
 
 class CastStart(NamedTuple):
@@ -24,7 +24,7 @@ def full_mask(n_samples: int) -> UInt64Array:
     return np.array(ones, dtype=np.uint64)
 
 
-def face_light(receivers: Receivers, light: RectLight, group_size: int) -> CastStart:
+def face_light(receivers: Receivers, light: Light, group_size: int) -> CastStart:
     """Choose the receivers' sample sets, and decide by exact signs what they do not face."""
     samples = light.light_samples(group_size)
     sample_sets = sample_sets_of(receivers.index, light.seed, light.sets)

@@ -67,8 +67,9 @@ def header_attributes(settings: Settings, stats: Stats, plan: object) -> dict[st
         "penumbra:plan": str(plan),
         "penumbra:seconds": sum(stats.seconds.values()),
     }
-    for name in ("samples", "sets", "seed"):
-        values = {light["name"]: light[name] for light in lights}
-        same = len(set(values.values())) == 1
-        attributes[f"penumbra:{name}"] = lights[0][name] if same else canonical(values)
+    # A light that has no such choice, a point, has one sample.
+    for name, default in (("samples", 1), ("sets", 1), ("seed", 0)):
+        values = {light["name"]: light.get(name, default) for light in lights}
+        first, *others = set(values.values())
+        attributes[f"penumbra:{name}"] = canonical(values) if others else first
     return attributes | {f"penumbra:{name}": value for name, value in stats.as_dict().items()}

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,7 @@ from penumbra.errors import SceneError
 MAX_SETS = 256
 MAX_SAMPLES = 1 << 16
 MAX_SEED = 2**63 - 1
+PATTERNS = ("jittered", "regular")
 # Sixteen roundings of subnormal numbers.
 _SUBNORMAL_ROUNDING = 16 * 5e-324
 _U64 = np.uint64
@@ -30,6 +32,7 @@ class RectLight:
     two_sided: bool = False
     radiance: float = 1.0
     name: str = "light"
+    pattern: str = "jittered"
 
     def __init__(
         self,
@@ -42,12 +45,15 @@ class RectLight:
         two_sided: bool = False,
         radiance: float = 1.0,
         name: str = "light",
+        pattern: str = "jittered",
     ) -> None:
         """Check and keep the numbers.
 
         corner, edge_u, edge_v: three numbers each, world space. `samples` (K) points per set, one in
         each of K strata of equal area; `sets` distinct sample sets against banding (HPC section 3.4);
-        `radiance` in W m^-2 sr^-1. Raises SceneError for numbers that are not finite or out of range.
+        `radiance` in W m^-2 sr^-1. `pattern`: "jittered", a random point of every stratum, or "regular",
+        its centre (all sets are then equal). Raises SceneError for numbers that are not finite or out of
+        range, and for other patterns.
         """
         keep = partial(object.__setattr__, self)
         keep("name", str(name))
@@ -64,10 +70,27 @@ class RectLight:
         )
         for field, value, low, high in whole:
             keep(field, _whole_number(value, f"{field} of light '{name}'", low, high))
-        if not (isinstance(radiance, int | float | np.number) and np.isfinite(radiance) and radiance >= 0):
-            raise SceneError(f"radiance of light '{name}' is {radiance!r}: give a number >= 0")
-        keep("radiance", float(radiance))
+        keep("radiance", _amount(radiance, f"radiance of light '{name}'"))
         keep("two_sided", bool(two_sided))
+        if pattern not in PATTERNS:
+            raise SceneError(f"pattern of light '{name}' is {pattern!r}: give 'jittered' or 'regular'")
+        keep("pattern", pattern)
+
+    def settings(self) -> dict[str, Any]:
+        """Everything that makes this light, by the keys of a scene file; JSON values."""
+        return {
+            "name": self.name,
+            "type": "rect",
+            "corner": self.corner.tolist(),
+            "edge_u": self.edge_u.tolist(),
+            "edge_v": self.edge_v.tolist(),
+            "samples": self.samples,
+            "sets": self.sets,
+            "seed": self.seed,
+            "pattern": self.pattern,
+            "radiance": self.radiance,
+            "two_sided": self.two_sided,
+        }
 
     @cached_property
     def area(self) -> float:
@@ -95,7 +118,11 @@ class RectLight:
     def _parameters(self) -> Float64Array:
         """(sets, K, 2): positions of the samples along edge_u and edge_v, in [0, 1)."""
         low, size = _strata(self.samples, _length(self.edge_u), _length(self.edge_v))
-        jitter = np.random.default_rng(self.seed).random((self.sets, self.samples, 2))
+        shape = (self.sets, self.samples, 2)
+        if self.pattern == "regular":
+            jitter = np.full(shape, 0.5)
+        else:
+            jitter = np.random.default_rng(self.seed).random(shape)
         parameters: Float64Array = low + jitter * size
         parameters.setflags(write=False)
         return parameters
@@ -134,6 +161,65 @@ class RectLight:
         return corners
 
 
+@dataclass(frozen=True, eq=False, init=False)
+class PointLight:
+    """A light without size that shines all round: one sample, so that every shadow is hard."""
+
+    samples: ClassVar[int] = 1
+    sets: ClassVar[int] = 1
+    seed: ClassVar[int] = 0
+    two_sided: ClassVar[bool] = True
+
+    position: Float64Array
+    intensity: float = 1.0
+    name: str = "light"
+
+    def __init__(self, position: ArrayLike, intensity: float = 1.0, name: str = "light") -> None:
+        """Check and keep the numbers.
+
+        position: three numbers, world space. `intensity` in W sr^-1, the same in every direction. Raises
+        SceneError for numbers that are not finite, and for an intensity below 0.
+        """
+        keep = partial(object.__setattr__, self)
+        keep("name", str(name))
+        keep("position", _vector(position, f"position of light '{name}'"))
+        keep("intensity", _amount(intensity, f"intensity of light '{name}'"))
+
+    def settings(self) -> dict[str, Any]:
+        """Everything that makes this light, by the keys of a scene file; JSON values."""
+        return {
+            "name": self.name,
+            "type": "point",
+            "position": self.position.tolist(),
+            "intensity": self.intensity,
+        }
+
+    @cached_property
+    def sample_points(self) -> Float64Array:
+        """The position as the light's only sample, float64 (1, 1, 3), world space."""
+        points = self.position.reshape(1, 1, 3)
+        points.setflags(write=False)
+        return points
+
+    def light_samples(self, group_size: int) -> LightSamples:
+        """Light and sample as casting wants them; there is nothing to group, whatever `group_size` says."""
+        return LightSamples(
+            corner=np.array(self.position),
+            origin=np.array(self.position),
+            edge_u=np.zeros(3),
+            edge_v=np.zeros(3),
+            parameters=np.zeros((1, 2, 0), np.float32),
+            points=np.array(self.sample_points),
+            corners=np.tile(self.position, (1, 4, 1)),
+            n_samples=1,
+            full_groups=_full_groups(1, group_size),
+            residual=0.0,
+        )
+
+
+Light: TypeAlias = RectLight | PointLight
+
+
 def sample_sets_of(index: Int64Array, seed: int, sets: int) -> UInt8Array:
     """Sample set of each receiver, uint8 (R,): a fixed hash (SplitMix64) of its index and the seed."""
     with np.errstate(over="ignore"):
@@ -153,6 +239,12 @@ def _vector(value: ArrayLike, what: str) -> Float64Array:
         raise SceneError(f"{what} is {value!r}: give three finite numbers")
     vector.setflags(write=False)
     return vector
+
+
+def _amount(value: float, what: str) -> float:
+    if not (isinstance(value, int | float | np.number) and np.isfinite(value) and value >= 0):
+        raise SceneError(f"{what} is {value!r}: give a number >= 0")
+    return float(value)
 
 
 def _whole_number(value: object, what: str, low: int, high: int) -> int:

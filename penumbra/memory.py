@@ -9,6 +9,7 @@ from pathlib import Path
 
 _STATUS = Path("/proc/self/status")
 _MEMINFO = Path("/proc/meminfo")
+_CLEAR_REFS = Path("/proc/self/clear_refs")
 _CGROUPS = Path("/sys/fs/cgroup")
 
 # (limit file, usage file) of the two cgroup versions, relative to a group's folder.
@@ -33,6 +34,18 @@ def peak_bytes() -> int:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     # ru_maxrss counts KiB everywhere but on macOS, where it counts bytes.
     return peak if sys.platform == "darwin" else peak * 1024
+
+
+def reset_peak() -> bool:
+    """Start the peak anew from what is resident now; False where the system cannot (then nothing changes).
+
+    Linux resets VmHWM when 5 is written to /proc/self/clear_refs (proc(5)).
+    """
+    try:
+        _CLEAR_REFS.write_text("5")
+    except OSError:
+        return False
+    return True
 
 
 def available_bytes() -> int:

@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import dataclass
+from typing import Literal
 
 from penumbra.errors import SceneError
 
@@ -11,6 +12,7 @@ _UNIT_BYTES = {"": 1, "b": 1} | {
     for power, prefix in enumerate("kmgt", start=1)
     for suffix, base in (("b", 1000), ("ib", 1024))
 }
+_MOST_CELLS = 4096
 _SIZE = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", re.IGNORECASE)
 
 
@@ -49,7 +51,7 @@ class IngestOptions:
 
 @dataclass(frozen=True)
 class CastOptions:
-    """Switches of the casting engine (Laine & Aila 2005, sections 3.2 to 3.4); none changes a bit."""
+    """Switches and sizes of the casting engines (Laine & Aila 2005; Wang et al. 2014); none changes a bit."""
 
     umbra_bits: bool = True
     """A: skip groups, receivers and nodes that are already fully in umbra."""
@@ -70,9 +72,30 @@ class CastOptions:
     rebuild_fraction: float = 0.25
     """Rebuild the receiver BVH once this fraction of its receivers is in umbra since it was built."""
 
+    grid_resolution: int = 128
+    """gears: cells along each axis of the grid (GEARS section 4.3)."""
+    grid_spacing: Literal["quantile", "regular"] = "quantile"
+    """gears: columns and rows that hold equally many receivers each, or of equal width, as in the paper."""
+    grid_eye: float = 0.5
+    """gears: distance of the grid's eye from the light, in diagonals of the light (GEARS section 3.1)."""
+    correct_extrusion: bool = True
+    """gears: extrude shadow volumes only to the farthest receiver of the cells they touch (section 3.1)."""
+    pair_bytes: int = 16 << 20
+    """gears: memory for the blockers of all cells, which decides how many blockers are taken at a time."""
+
     def __post_init__(self) -> None:
         if self.group_size not in (32, 64):
             raise SceneError(f"group_size is {self.group_size}: a light sample group has 32 or 64 samples")
+        _at_least("grid_resolution", self.grid_resolution, 1)
+        _at_least("pair_bytes", self.pair_bytes, 4)
+        if self.grid_resolution > _MOST_CELLS:
+            raise SceneError(f"grid_resolution is {self.grid_resolution}: it may be {_MOST_CELLS} at most")
+        if self.grid_spacing not in ("quantile", "regular"):
+            raise SceneError(f"grid_spacing is {self.grid_spacing!r}: give 'quantile' or 'regular'")
+        if not (math.isfinite(self.grid_eye) and self.grid_eye >= 0):
+            raise SceneError(
+                f"grid_eye is {self.grid_eye}: it must be a number of light diagonals, 0 or more"
+            )
         _at_least("tile_receivers", self.tile_receivers, 1)
         _at_least("leaf_receivers", self.leaf_receivers, 1)
         if not (math.isfinite(self.rebuild_fraction) and self.rebuild_fraction > 0):

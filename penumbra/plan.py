@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 from penumbra.errors import MemoryLimitError
@@ -21,6 +21,8 @@ _RESULT_BYTES = 5  # a receiver in the result, without its mask
 _MASK_WORD_BYTES = 16  # 64 light samples of a receiver: in the result, and at worst in its tile's pool too
 _SAMPLE_BYTES = 64  # a light sample of one set, as point and as lane
 _PREVIEW_BYTES = 24  # a pixel while the picture is exposed
+_CELL_BYTES = 64  # a cell of the grid of receivers
+_BOUND_BYTES = 64  # a blocker of a chunk while its cells are found, on either side of the light
 _ENCODE_BYTES = 24 << 20  # buffers of the EXR encoder
 _STORE_BYTES = 48 << 20  # two chunks of 64 Ki blockers with boxes and reading buffers, the store's index
 _READ_TRIANGLE_BYTES = 260  # a blocker while it is read and sorted in memory
@@ -38,6 +40,13 @@ class LightPlan(NamedTuple):
     name: str
     samples: int
     sets: int
+    is_point: bool = False
+
+    def __str__(self) -> str:
+        """Return what of the light is cast."""
+        return f"{self.name}: " + (
+            "a point" if self.is_point else f"{self.samples} samples in {self.sets} sets"
+        )
 
 
 class GeometryPlan(NamedTuple):
@@ -86,6 +95,11 @@ class RenderPlan:
                 (len(self.passes) == 1, "no second pass: the receivers of the whole picture fit in memory"),
                 (len(self.lights) == 1, "no sum over lights: there is one"),
                 (all(light.sets == 1 for light in self.lights), "no choice of sample set: there is one"),
+                (
+                    all(light.is_point for light in self.lights),
+                    "no light sample groups: "
+                    + ("the light is a point" if len(self.lights) == 1 else "all lights are points"),
+                ),
             )
             if applies
         )
@@ -110,7 +124,7 @@ class RenderPlan:
         )
         lines = [
             ("picture", f"{width} x {height}, window {x0} {y0} {x1} {y1}: {(x1 - x0) * (y1 - y0):,} pixels"),
-            *(("light", f"{name}: {samples} samples in {sets} sets") for name, samples, sets in self.lights),
+            *(("light", str(light)) for light in self.lights),
             ("blockers", f"{about}{self.geometry.n_triangles:,} triangles from {self.source}"),
             ("", f"read {n_reads} times at most: to see, and for each light, in each pass"),
             ("passes", f"{len(self.passes)} of up to {rows} rows, on {self.threads} threads"),
@@ -132,19 +146,21 @@ def make_plan(
     resident_bytes: int,
     threads: int,
     process_limit: bool = True,
+    engine_bytes: int = 0,
 ) -> RenderPlan:
     """Choose where the blockers live and how many passes there are.
 
     `limit_bytes` is of the whole process, of which `resident_bytes` are taken before the render begins.
     Raises MemoryLimitError when not even one row of pixels fits; the message has a limit that would do:
-    of the process when `process_limit`, else of what is added to `resident_bytes`.
+    of the process when `process_limit`, else of what is added to `resident_bytes`. `engine_bytes` is what
+    the backend takes beside receivers and light (`backend_bytes`).
     """
     film = film_bytes(window, len(lights))
     free = limit_bytes - resident_bytes - _KERNEL_BYTES - film
     n_words = max(-(-light.samples // 64) for light in lights)
     row_bytes = (window[2] - window[0]) * _pixel_bytes(n_words)
     write_bytes = _ENCODE_BYTES + (window[2] - window[0]) * (window[3] - window[1]) * _PREVIEW_BYTES
-    light_bytes = max(light.samples * light.sets for light in lights) * _SAMPLE_BYTES
+    light_bytes = max(light.samples * light.sets for light in lights) * _SAMPLE_BYTES + engine_bytes
     source, ingest_bytes, blocker_bytes = _place_blockers(geometry, free, light_bytes + row_bytes)
     least = max(ingest_bytes, blocker_bytes + light_bytes + row_bytes, write_bytes)
     if free < least:
@@ -169,6 +185,24 @@ def make_plan(
         pass_bytes=light_bytes + max(y1 - y0 for _, y0, _, y1 in passes) * row_bytes,
         write_bytes=write_bytes,
         scratch_bytes=geometry.n_triangles * _SCRATCH_TRIANGLE_BYTES if source == "temporary store" else 0,
+    )
+
+
+def backend_bytes(backend: str, options: CastOptions, chunk_triangles: int) -> int:
+    """Memory that a backend takes beside receivers and light: lists of the cells, bounds of a chunk."""
+    if backend != "gears":
+        return 0
+    grid_bytes = options.grid_resolution**2 * _CELL_BYTES
+    return options.pair_bytes + grid_bytes + chunk_triangles * _BOUND_BYTES
+
+
+def fitted_options(options: CastOptions, limit_bytes: int) -> CastOptions:
+    """Options with a grid, and lists of its cells, that take an eighth of the limit each at most."""
+    eighth = max(limit_bytes // 8, _CELL_BYTES)
+    return replace(
+        options,
+        pair_bytes=min(options.pair_bytes, eighth),
+        grid_resolution=min(options.grid_resolution, math.isqrt(eighth // _CELL_BYTES)),
     )
 
 
@@ -231,5 +265,5 @@ def _refusal(resolution: tuple[int, int], window: Window, n_words: int, limit: i
     return (
         f"a picture of {window[2] - window[0]} x {window[3] - window[1]} pixels (of {width} x {height}) "
         f"with up to {64 * n_words} light samples does not fit the memory limit of {format_bytes(limit)}: "
-        f"give {enough >> 20}MiB or more, or render a smaller --crop"
+        f"give {enough >> 20}MiB or more, or render fewer pixels (--resolution, --crop)"
     )

@@ -1,5 +1,7 @@
 """4: receivers in tiles, each with its own hierarchy: the unit of work of a thread."""
 
+import math
+
 import numpy as np
 
 from penumbra.arrays import (
@@ -46,6 +48,7 @@ class ReceiverTile:
         group_size: int,
         leaf_receivers: int,
         lazy_masks: bool,
+        has_masks: bool = True,
     ) -> None:
         self.rows = rows
         self.n_rebuilds = 0
@@ -55,8 +58,9 @@ class ReceiverTile:
         self._light = light
         self._group_size = group_size
         self._leaf_receivers = leaf_receivers
-        self.pool = _new_pool(len(rows), full, _FIRST_MASKS if lazy_masks else len(rows))
-        if not lazy_masks:
+        first_masks = _FIRST_MASKS if lazy_masks else len(rows)
+        self.pool = _new_pool(len(rows), full, first_masks if has_masks else 0)
+        if has_masks and not lazy_masks:
             self._give_masks(np.arange(len(rows)))
         self._blocker_extent = blocker_extent
 
@@ -183,5 +187,7 @@ def _shaft(tile_box: Float64Array, light: LightSamples, blocker_extent: float) -
     box, planes = np.empty(6), np.empty((N_SHAFT_PLANES, 4))
     # The slack of the planes must cover the rounding of what is tested against them.
     fill_shaft(tile_box, light_box, max(extent, blocker_extent), box, planes)
-    reach = float(np.linalg.norm(box[3:] - box[:3])) * (1 + 1e-9)
+    # Infinite for the largest numbers: then no volume is trusted.
+    with np.errstate(over="ignore"):
+        reach = math.hypot(*(box[3:] - box[:3])) * (1 + 1e-9)
     return Shaft(box, planes, extent, reach)

@@ -8,7 +8,7 @@ from penumbra.executors.threads import run_tasks
 from penumbra.facing import face_light
 from penumbra.kernels.counters import N_COUNTERS, NAMES
 from penumbra.kernels.reference import cast_reference
-from penumbra.lights import RectLight
+from penumbra.lights import Light
 from penumbra.options import CastOptions
 from penumbra.progress import Progress
 from penumbra.stats import Stats
@@ -19,7 +19,7 @@ _SLICE_RECEIVERS = 4096
 def cast_receivers(
     receivers: Receivers,
     blockers: Blockers,
-    light: RectLight,
+    light: Light,
     *,
     options: CastOptions,
     threads: int,

@@ -18,10 +18,11 @@ from penumbra.io.atomic import temporary_folder
 from penumbra.io.blocker_store import open_store
 from penumbra.io.exr import camera_attributes
 from penumbra.io.meshes import open_mesh
+from penumbra.lights import PointLight
 from penumbra.memory import call_limit_bytes, give_back, resident_bytes
-from penumbra.options import CastOptions, parse_size
+from penumbra.options import CastOptions, IngestOptions, parse_size
 from penumbra.outputs import Outputs, finished_image
-from penumbra.plan import GeometryPlan, LightPlan, RenderPlan, make_plan
+from penumbra.plan import GeometryPlan, LightPlan, RenderPlan, backend_bytes, make_plan
 from penumbra.progress import NullProgress, Progress
 from penumbra.scene import Scene
 from penumbra.settings import Settings, settings_of
@@ -61,7 +62,7 @@ def render(
     scene: a Scene, or the path of a scene file. output, preview, stats: files to write, as OpenEXR,
     exposed PNG and JSON. memory: bytes that this call may add to the resident memory, or a size such as
     "2GiB"; None is half of the free memory; with `process_limit` the limit is of the whole process.
-    backend: "hpc", "reference" or "auto"; all give the same bits. threads: 0 for all cores. crop:
+    backend: "hpc", "gears", "reference" or "auto"; all give the same bits. threads: 0 for all cores. crop:
     (x0, y0, x1, y1), half-open, from the upper left: exactly these pixels of the full picture. seed,
     samples, resolution: in place of the scene's. scratch: folder of the temporary store of geometry that
     does not fit in memory, beside `output` by default. resume: do nothing when `output` is there and was
@@ -85,12 +86,12 @@ def render(
         outputs.refuse_existing()
     scratch_parent = outputs.scratch_parent(scratch)
     cast_receivers = backend_named(backend)
-    plan = _make_plan(scene, window, memory, process_limit, threads)
+    plan = _make_plan(scene, window, memory, process_limit, threads, backend)
     run = Stats(backend)
     with run.timed("compile"):
         compile_ahead(progress)
     film = Film(*plan.resolution, window, [light.name for light in scene.lights])
-    with _open_blockers(scene, plan, scratch_parent, run, progress) as blockers:
+    with open_blockers(scene, plan, scratch_parent, run, progress) as blockers:
         for band in plan.passes:
             _render_band(scene, blockers, band, cast_receivers, plan.threads, film, run, progress)
     image = _develop(film, scene, settings, plan, run)
@@ -159,17 +160,17 @@ def plan_render(
     scene, window = _effective_scene(scene, crop, seed, samples, resolution)
     _checked_outputs(scene, output, preview, stats).scratch_parent(scratch)
     backend_named(backend)
-    return _make_plan(scene, window, memory, process_limit, threads)
+    return _make_plan(scene, window, memory, process_limit, threads, backend)
 
 
 def visible_points(scene: SceneLike, threads: int = 0, progress: Progress | None = None) -> GBuffer:
     """Return the receivers of a scene's whole picture, exactly those that `render` casts."""
     progress = progress or NullProgress()
     scene, window = _effective_scene(scene, None, None, None, None)
-    plan = _make_plan(scene, window, None, False, threads)
+    plan = _make_plan(scene, window, None, False, threads, "hpc")
     run = Stats("")
     scratch = Outputs(None, None, None).scratch_parent(None)
-    with _open_blockers(scene, plan, scratch, run, progress) as blockers:
+    with open_blockers(scene, plan, scratch, run, progress) as blockers:
         return find_visible(blockers, scene.camera, window, threads=plan.threads, progress=progress)
 
 
@@ -206,7 +207,7 @@ def _checked_outputs(
 
 
 def _make_plan(
-    scene: Scene, window: Window, memory: int | str | None, process_limit: bool, threads: int
+    scene: Scene, window: Window, memory: int | str | None, process_limit: bool, threads: int, backend: str
 ) -> RenderPlan:
     asked, resident = parse_size(memory), resident_bytes()
     # None asks for a part of what is free now, which is never a limit of the whole process.
@@ -215,12 +216,16 @@ def _make_plan(
     return make_plan(
         scene.camera.resolution,
         window,
-        [LightPlan(light.name, light.samples, light.sets) for light in scene.lights],
+        [
+            LightPlan(light.name, light.samples, light.sets, isinstance(light, PointLight))
+            for light in scene.lights
+        ],
         _measure_geometry(scene),
         limit_bytes=asked if asked is not None and process_limit else resident + added,
         resident_bytes=resident,
         threads=resolve_threads(threads),
         process_limit=process_limit,
+        engine_bytes=backend_bytes(backend, CastOptions(), IngestOptions().chunk_triangles),
     )
 
 
@@ -242,7 +247,7 @@ def _measure_geometry(scene: Scene) -> GeometryPlan:
 
 
 @contextmanager
-def _open_blockers(
+def open_blockers(
     scene: Scene, plan: RenderPlan, scratch: Path, run: Stats, progress: Progress
 ) -> Iterator[Blockers]:
     """Open the store, or make the blockers: in memory, or in a store that is removed afterwards."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from penumbra.arrays import Float64Array
 from penumbra.errors import SceneError
-from penumbra.lights import RectLight
+from penumbra.lights import Light, RectLight
 
 # OpenEXR cuts channel names at 255 bytes without a word; the longest layer adds 22.
 _LONGEST_LIGHT_NAME = 200
@@ -124,7 +124,7 @@ class Scene:
 
     geometry: tuple[MeshRef, ...]
     camera: Camera
-    lights: tuple[RectLight, ...]
+    lights: tuple[Light, ...]
     path: Path | None = None
     """The scene file, if it came from one."""
 
@@ -147,12 +147,15 @@ class Scene:
     def with_overrides(
         self, resolution: tuple[int, int] | None = None, samples: int | None = None, seed: int | None = None
     ) -> "Scene":
-        """The same scene with another resolution, or other samples or seed in every light; None keeps."""
+        """The same scene with another resolution, or with other samples or seed in every rect light."""
         camera = self.camera if resolution is None else replace(self.camera, resolution=resolution)
         changes: dict[str, Any] = {
             name: value for name, value in (("samples", samples), ("seed", seed)) if value is not None
         }
-        lights = tuple(replace(light, **changes) for light in self.lights) if changes else self.lights
+        lights = tuple(
+            replace(light, **changes) if changes and isinstance(light, RectLight) else light
+            for light in self.lights
+        )
         return replace(self, camera=camera, lights=lights)
 
 

@@ -5,8 +5,6 @@ import json
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-
 from penumbra import __version__
 from penumbra.film import Window
 from penumbra.scene import MeshRef, Scene
@@ -27,20 +25,7 @@ def settings_of(scene: Scene, window: Window) -> Settings:
         "crop": list(window),
         "camera": {key: list(value) if isinstance(value, tuple) else value for key, value in camera.items()},
         "geometry": [_geometry_settings(mesh) for mesh in scene.geometry],
-        "lights": [
-            {
-                "name": light.name,
-                "corner": np.asarray(light.corner).tolist(),
-                "edge_u": np.asarray(light.edge_u).tolist(),
-                "edge_v": np.asarray(light.edge_v).tolist(),
-                "samples": light.samples,
-                "sets": light.sets,
-                "seed": light.seed,
-                "two_sided": light.two_sided,
-                "radiance": float(light.radiance),
-            }
-            for light in scene.lights
-        ],
+        "lights": [light.settings() for light in scene.lights],
     }
 
 

@@ -26,10 +26,15 @@ class Stats:
     backend: str
     counters: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    most: dict[str, int] = field(default_factory=dict)
 
     def count(self, name: str, amount: int) -> None:
         """Add to a counter."""
         self.counters[name] = self.counters.get(name, 0) + int(amount)
+
+    def count_most(self, name: str, amount: int) -> None:
+        """Raise a counter to an amount; `merge` keeps the larger one of two."""
+        self.most[name] = max(self.most.get(name, 0), int(amount))
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -44,6 +49,8 @@ class Stats:
         """Add the counters and seconds of another run."""
         for name, amount in other.counters.items():
             self.count(name, amount)
+        for name, amount in other.most.items():
+            self.count_most(name, amount)
         for stage, seconds in other.seconds.items():
             self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
 
@@ -51,5 +58,5 @@ class Stats:
         """One flat dictionary: backend, seconds_<stage>, the counters, peak_bytes of the process."""
         flat: dict[str, Any] = {"backend": self.backend}
         flat |= {f"seconds_{stage}": round(seconds, 6) for stage, seconds in self.seconds.items()}
-        flat |= dict.fromkeys(_ALWAYS, 0) | self.counters
+        flat |= dict.fromkeys(_ALWAYS, 0) | self.counters | self.most
         return flat | {"peak_bytes": peak_bytes()}

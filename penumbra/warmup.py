@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from penumbra.lights import RectLight
+from penumbra.lights import PointLight, RectLight
 from penumbra.progress import NullProgress, Progress
 from penumbra.scene import Camera, MeshRef, Scene
 
@@ -33,7 +33,7 @@ def warm_up(progress: Progress | None = None) -> Path:
         (folder / "a.obj").write_text(_OBJ)
         (folder / "b.ply").write_bytes(_PLY_HEADER.encode() + _ply_body())
         ingest([folder / "a.obj", folder / "b.ply"], folder / "scene.h5").close()
-        for backend in ("hpc", "reference"):
+        for backend in ("hpc", "gears", "reference"):
             render(_scene(folder / "scene.h5"), folder / f"{backend}.exr", backend=backend)
     progress.close()
     return cache_folder()
@@ -49,4 +49,4 @@ def _ply_body() -> bytes:
 def _scene(store: Path) -> Scene:
     light = RectLight([-0.4, 2.0, -0.4], [0.8, 0, 0], [0, 0, 0.8], samples=40, name="key")
     camera = Camera((0, 2, 3), (0, 0, 0), resolution=(16, 12))
-    return Scene((MeshRef(store),), camera, (light,))
+    return Scene((MeshRef(store),), camera, (light, PointLight([0.3, 1.5, 0.2], name="lamp")))

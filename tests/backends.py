@@ -11,7 +11,7 @@ import penumbra
 from penumbra.api import CastResult
 
 # A new backend joins every test of bits by adding its name here.
-BACKENDS = ["reference", "hpc"]
+BACKENDS = ["reference", "hpc", "gears"]
 
 Masks = NDArray[np.uint64]
 
@@ -44,15 +44,17 @@ def decided_masks(scene: SmallScene, sample_set: NDArray[np.uint8]) -> Masks:
     light = scene.light
     arrays = (scene.points, scene.triangles, light.sample_points, sample_set, scene.normals, scene.own)
     flags = bytes([light.two_sided, scene.normals is None, scene.own is None])
-    edges = np.concatenate([light.corner, light.edge_u, light.edge_v])
-    key = (flags, edges.tobytes(), *(np.asarray(array).tobytes() for array in arrays))
+    # A light that shines all round has no plane that a receiver could be behind.
+    is_rect = isinstance(light, penumbra.RectLight)
+    plane = (light.corner, light.edge_u, light.edge_v) if is_rect else (np.zeros(3),) * 3
+    key = (flags, np.concatenate(plane).tobytes(), *(np.asarray(array).tobytes() for array in arrays))
     if key not in _decided:
         _decided[key] = oracle.masks(
             scene.points,
             scene.triangles,
             light.sample_points,
             sample_set,
-            light=(light.corner, light.edge_u, light.edge_v),
+            light=plane,
             two_sided=light.two_sided,
             normals=scene.normals,
             own=scene.own,

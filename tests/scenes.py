@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from penumbra import RectLight
+from penumbra import PointLight, RectLight
+from penumbra.lights import Light
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator
@@ -24,7 +25,7 @@ class SmallScene:
 
     points: Floats
     triangles: Floats
-    light: RectLight
+    light: Light
     normals: Floats | None = None
     own: NDArray[np.int64] | None = None
 
@@ -54,17 +55,20 @@ def light_named(name: str, samples: int, sets: int = 1, seed: int = 7) -> RectLi
 def transformed(scene: SmallScene, scale: float, offset: float) -> SmallScene:
     """The scene scaled, then moved by (offset, -offset, offset / 2), rounded as float64 rounds."""
     move = np.array([1.0, -1.0, 0.5]) * offset
-    light = scene.light
+    light: Any = scene.light
+    if isinstance(light, PointLight):
+        vectors = {"position": light.position * scale + move}
+    else:
+        vectors = {
+            "corner": light.corner * scale + move,
+            "edge_u": light.edge_u * scale,
+            "edge_v": light.edge_v * scale,
+        }
     return replace(
         scene,
         points=scene.points * scale + move,
         triangles=scene.triangles * scale + move,
-        light=replace(
-            light,
-            corner=light.corner * scale + move,
-            edge_u=light.edge_u * scale,
-            edge_v=light.edge_v * scale,
-        ),
+        light=replace(light, **vectors),
     )
 
 

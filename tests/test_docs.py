@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,23 @@ _LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)[^)]*\)")
 _MACHINE_PATH = re.compile(r"(?<![\w./~])/(?:work|tmp|home|root|Users|usr)/")
 
 
-@pytest.mark.parametrize("name", cli.commands)
+def _commands(group: click.Group, prefix: str = "") -> Iterator[tuple[str, click.Command]]:
+    """All commands by their full name: `bench`, `bench error`."""
+    for name, command in group.commands.items():
+        yield prefix + name, command
+        if isinstance(command, click.Group):
+            yield from _commands(command, f"{prefix}{name} ")
+
+
+COMMANDS = dict(_commands(cli))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_is_explained(name: str) -> None:
-    command = cli.commands[name]
+    command = COMMANDS[name]
     assert command.help and f"Example: penumbra {name}" in command.help
-    assert f"## penumbra {name}" in COMMAND_LINE
-    section = COMMAND_LINE.split(f"## penumbra {name}", 1)[1].split("\n## ", 1)[0]
+    assert f"## penumbra {name}\n" in COMMAND_LINE
+    section = COMMAND_LINE.split(f"## penumbra {name}\n", 1)[1].split("\n## ", 1)[0]
     for option in command.params:
         if isinstance(option, click.Option) and not {"-q", "-v"} & set(option.opts):
             assert option.help, option.name

@@ -15,6 +15,7 @@ from scenes import Floats
 import penumbra
 from penumbra import RectLight
 from penumbra.arrays import BoolArray
+from penumbra.lights import Light
 
 pytestmark = pytest.mark.skipif(find_spec("embreex") is None, reason="embreex is not installed")
 
@@ -41,7 +42,7 @@ def receivers_above(triangles: Floats, n_receivers: int) -> Floats:
     return on + 1e-3 * size * normals / np.maximum(lengths, 1e-300)
 
 
-def receivers_behind_vertices(triangles: Floats, light: RectLight, n_receivers: int) -> Floats:
+def receivers_behind_vertices(triangles: Floats, light: Light, n_receivers: int) -> Floats:
     """Points from which a vertex, or the middle of an edge, hides a sample, up to rounding."""
     rng = np.random.default_rng(12)
     chosen = triangles[rng.integers(0, len(triangles), n_receivers)]

@@ -14,6 +14,7 @@ PUBLIC = {
     "CastOptions",
     "IngestOptions",
     "MeshRef",
+    "PointLight",
     "RectLight",
     "Scene",
     "__version__",
@@ -55,6 +56,7 @@ PARAMETERS = {
     "render": "scene output *memory *backend *threads *crop *seed *samples *resolution *preview *stats "
     "*scratch *resume *overwrite *progress",
     "RectLight": "corner edge_u edge_v samples sets seed two_sided",
+    "PointLight": "position intensity name",
 }
 
 

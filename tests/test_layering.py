@@ -21,12 +21,13 @@ THIRD_PARTY_HOMES = {
     "PIL": "io/png.py",
     "click": "cli/",
     "trimesh": "io/other_formats.py",
+    "matplotlib": "measure/plots.py",
 }
-HEAVY = ("numba", "llvmlite", "h5py", "trimesh", "OpenEXR", "PIL")
+HEAVY = ("numba", "llvmlite", "h5py", "trimesh", "OpenEXR", "PIL", "matplotlib")
 
-STAGES = ("ingest", "visible", "receivers", "casting", "reference", "shading")
-# The receiver hierarchy is rebuilt while casting goes on, so that casting is what owns it.
-STAGE_IN_STAGE = {("casting.py", "receivers")}
+STAGES = ("ingest", "visible", "receivers", "receiver_grid", "casting", "gears", "reference", "shading")
+# The receiver hierarchy, and the grid, are built again while casting goes on, so casting owns them.
+STAGE_IN_STAGE = {("casting.py", "receivers"), ("gears.py", "receiver_grid")}
 
 # Folder or file: what of penumbra it may import (a name stands for what is below it, too).
 ALLOWED = {
@@ -167,6 +168,17 @@ def test_the_command_line_imports_the_library_where_it_uses_it() -> None:
     ]
 
 
+def test_nothing_but_the_command_line_needs_the_measurements() -> None:
+    wrong = [
+        str(found)
+        for found in IMPORTS
+        if found.module.startswith("penumbra.measure") and not found.file.startswith(("measure/", "cli/"))
+    ]
+    assert not wrong
+    # pyplot keeps figures in a global state and chooses a backend by the screen that it finds.
+    assert "pyplot" not in {name for found in IMPORTS for name in found.module.split(".")}
+
+
 def test_one_place_decides_how_kernels_are_compiled() -> None:
     wrong = [
         path.name
@@ -176,7 +188,7 @@ def test_one_place_decides_how_kernels_are_compiled() -> None:
     assert not wrong
 
 
-COMMANDS = ("demo", "ingest", "render", "info", "warmup")
+COMMANDS = ("demo", "ingest", "render", "info", "bench", "bench error", "bench stability", "warmup")
 
 
 @pytest.mark.parametrize(
@@ -186,7 +198,7 @@ COMMANDS = ("demo", "ingest", "render", "info", "warmup")
         "import penumbra; dir(penumbra); penumbra.Scene, penumbra.Camera, penumbra.MeshRef",
         "import penumbra; penumbra.RectLight, penumbra.CastOptions, penumbra.IngestOptions",
         "from penumbra.cli.main import run; run(['--help'])",
-        *(f"from penumbra.cli.main import run; run(['{command}', '--help'])" for command in COMMANDS),
+        *(f"from penumbra.cli.main import run; run('{command} --help'.split())" for command in COMMANDS),
     ],
 )
 def test_nothing_heavy_is_loaded_before_it_is_needed(statement: str) -> None:

@@ -1,9 +1,12 @@
 """What `penumbra info` says: facts about a file as a dictionary, and those as text."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from penumbra.errors import SceneError
+
+if TYPE_CHECKING:
+    from penumbra.lights import Light
 
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
@@ -88,21 +91,16 @@ def _scene(path: Path) -> Facts:
             "vfov": camera.vfov,
             "resolution": list(camera.resolution),
         },
-        "light": [
-            {
-                "name": light.name,
-                "corner": [float(x) for x in light.corner],
-                "edge_u": [float(x) for x in light.edge_u],
-                "edge_v": [float(x) for x in light.edge_v],
-                "area": light.area,
-                "samples": light.samples,
-                "sets": light.sets,
-                "radiance": light.radiance,
-                "two_sided": light.two_sided,
-            }
-            for light in scene.lights
-        ],
+        "light": [_light(light) for light in scene.lights],
     }
+
+
+def _light(light: "Light") -> Facts:
+    from penumbra.lights import RectLight
+
+    # A scene file has no seed.
+    facts = {key: value for key, value in light.settings().items() if key != "seed"}
+    return facts | {"area": light.area} if isinstance(light, RectLight) else facts
 
 
 def _image(path: Path) -> Facts:

@@ -18,6 +18,7 @@ import click
 
 from penumbra import __version__
 from penumbra.cli import options
+from penumbra.cli.bench import bench
 from penumbra.cli.console import Console, error, flush_results
 from penumbra.cli.demo import demo
 from penumbra.cli.info import info
@@ -60,7 +61,7 @@ def cli() -> None:
     """
 
 
-for _command in (demo, ingest, render, info, warmup):
+for _command in (demo, ingest, render, info, bench, warmup):
     cli.add_command(_command)
 
 

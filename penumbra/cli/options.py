@@ -1,17 +1,17 @@
-"""Every option of every command, defined once.
+"""Every option that commands share, defined once; what `bench` alone has stands with its commands.
 
 option          commands               meaning
 -o, --output    ingest, render, demo   where results go
---memory        ingest, render         most resident memory of the process
---overwrite     ingest, render         replace an output that is there
+--memory        ingest, render, bench  most resident memory of the process
+--overwrite     ingest, render, bench  replace an output that is there
 --skip-bad      ingest                 drop and count bad triangles
 --scratch       ingest, render         folder of temporary files
---resolution    render                 WxH in place of the scene's
+--resolution    render, bench          WxH in place of the scene's
 --samples       render                 light samples in place of the scene's
 --backend       render                 how visibility is decided
---threads       render                 0: all
+--threads       render, bench          0: all
 --crop          render                 the part of the picture to render
---seed          render                 of the light samples
+--seed          render, bench          of the light samples
 --resume        render                 keep a finished image of the same settings
 --preview       render                 also a PNG
 --stats         render                 also counters and seconds as JSON
@@ -29,7 +29,7 @@ import click
 
 from penumbra.cli.console import Console
 
-BACKENDS = ("hpc", "reference", "auto")
+BACKENDS = ("hpc", "gears", "reference", "auto")
 
 
 def _size(_context: click.Context, _parameter: click.Parameter, value: str) -> int | None:
@@ -42,9 +42,10 @@ def _size(_context: click.Context, _parameter: click.Parameter, value: str) -> i
         raise click.BadParameter(str(problem)) from None
 
 
-def _resolution(
+def resolution_of(
     _context: click.Context, _parameter: click.Parameter, value: str | None
 ) -> tuple[int, int] | None:
+    """Width and height of `WxH`, as a click callback."""
     if value is None:
         return None
     match = re.fullmatch(r"([1-9][0-9]{0,8})x([1-9][0-9]{0,8})", value, re.IGNORECASE)
@@ -132,14 +133,14 @@ scratch = click.option(
 resolution = click.option(
     "--resolution",
     metavar="WxH",
-    callback=_resolution,
+    callback=resolution_of,
     help="Width and height in pixels, in place of the scene's.",
 )
 samples = click.option(
     "--samples",
     metavar="N",
     type=click.IntRange(min=1),
-    help="Samples of every light, in place of the scene's.",
+    help="Samples of every rect light, in place of the scene's.",
 )
 backend = click.option(
     "--backend",

@@ -14,13 +14,11 @@ from typing import Any, NamedTuple, NoReturn, TypeVar
 import numpy as np
 
 from penumbra.errors import SceneError
-from penumbra.lights import RectLight
+from penumbra.lights import PATTERNS, Light, PointLight, RectLight
 from penumbra.scene import Camera, MeshRef, Scene, check_light_names
 
-TABLE_KEYS = {
-    "geometry": ("path", "transform", "up"),
-    "camera": ("eye", "look_at", "up", "vfov", "resolution"),
-    "light": (
+LIGHT_KEYS = {
+    "rect": (
         "name",
         "type",
         "corner",
@@ -28,11 +26,20 @@ TABLE_KEYS = {
         "edge_v",
         "samples",
         "sets",
+        "pattern",
         "radiance",
         "two_sided",
     ),
+    "point": ("name", "type", "position", "intensity"),
 }
-"""Every table of a scene file and every key it may have."""
+"""Every type of light and every key it may have."""
+
+TABLE_KEYS = {
+    "geometry": ("path", "transform", "up"),
+    "camera": ("eye", "look_at", "up", "vfov", "resolution"),
+    "light": tuple(dict.fromkeys(key for keys in LIGHT_KEYS.values() for key in keys)),
+}
+"""Every table of a scene file and every key it may have, whatever its type."""
 
 _HEADER = re.compile(r"\s*\[\[?\s*([\w.-]+)\s*\]\]?\s*(?:#.*)?$")
 _KEY = re.compile(r"\s*[\"']?([\w-]+)[\"']?\s*(?:\.|=)")
@@ -63,7 +70,11 @@ def read_scene(path: str | Path) -> Scene:
     }
     for kind, of_kind in tables.items():
         for table in of_kind:
-            table.check_keys(TABLE_KEYS[kind], table.label)
+            if kind == "light":
+                of_type = _light_type(table)
+                table.check_keys(LIGHT_KEYS[of_type], f"{table.label} of type {of_type}")
+            else:
+                table.check_keys(TABLE_KEYS[kind], table.label)
     geometry = tuple(_geometry(table) for table in tables["geometry"])
     camera = _camera(tables["camera"][0])
     lights = tuple(_light(table) for table in tables["light"])
@@ -144,11 +155,21 @@ def _camera(table: _Table) -> Camera:
     return table.build(lambda: Camera(eye, look_at, **given))
 
 
-def _light(table: _Table) -> RectLight:
+def _light_type(table: _Table) -> str:
+    found: str = table.given({"type": _LIGHT_TYPE}).get("type", "rect")
+    return found
+
+
+def _light(table: _Table) -> Light:
     name = table.needed("name", _LIGHT_NAME)
+    if _light_type(table) == "point":
+        position = table.needed("position", _VECTOR)
+        strength = table.given({"intensity": _NUMBER})
+        return table.build(lambda: PointLight(position, name=name, **strength))
     corner, edge_u, edge_v = (table.needed(key, _VECTOR) for key in ("corner", "edge_u", "edge_v"))
-    table.given({"type": _LIGHT_TYPE})
-    given = table.given({"samples": _COUNT, "sets": _COUNT, "radiance": _NUMBER, "two_sided": _SWITCH})
+    given = table.given(
+        {"samples": _COUNT, "sets": _COUNT, "pattern": _PATTERN, "radiance": _NUMBER, "two_sided": _SWITCH}
+    )
     return table.build(lambda: RectLight(corner, edge_u, edge_v, name=name, **given))
 
 
@@ -232,7 +253,8 @@ _VECTOR = _Kind(_list_of(3, _is_number), "three finite numbers")
 _DEGREES = _Kind(_is_number, "a number of degrees between 0 and 180")
 _PIXELS = _Kind(_list_of(2, _is_whole), "two whole numbers, width and height in pixels")
 _LIGHT_NAME = _Kind(_is_text, "a text, unique and without a dot")
-_LIGHT_TYPE = _Kind(lambda value: value == "rect", '"rect"')
+_LIGHT_TYPE = _Kind(lambda value: value in tuple(LIGHT_KEYS), '"rect" or "point"')
+_PATTERN = _Kind(lambda value: value in PATTERNS, '"jittered" or "regular"')
 _COUNT = _Kind(_is_whole, "a whole number above 0")
 _NUMBER = _Kind(_is_number, "a finite number")
 _SWITCH = _Kind(lambda value: isinstance(value, bool), "true or false")

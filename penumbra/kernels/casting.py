@@ -7,29 +7,27 @@ import numpy as np
 
 from penumbra.arrays import Blocker
 from penumbra.kernels._jit import helper, inlined, kernel
-from penumbra.kernels.bits import ONE, ZERO, lowest_bit, popcount64
+from penumbra.kernels.bits import ONE, ZERO, popcount64
 from penumbra.kernels.borrow import borrow
 from penumbra.kernels.counters import (
     BLOCKERS_CULLED,
     BLOCKERS_TESTED,
-    ESCALATED_F64,
     GROUP_VOLUMES_BUILT,
     LIGHT_VOLUMES_BUILT,
     NODES_VISITED,
     PAIRS_TESTED,
     PLANE_BOX_TESTS,
     PLANE_POINT_TESTS,
-    SAMPLES_TESTED,
     UMBRA_GROUPS_SKIPPED,
     UMBRA_NODES_SKIPPED,
     UMBRA_RECEIVERS_SKIPPED,
 )
 from penumbra.kernels.hard_shadow import (
+    block_group,
     fill_edges,
     fill_normal,
     light_side,
     receiver_side,
-    test_samples,
 )
 from penumbra.kernels.masks import (
     MASK_UMBRA,
@@ -49,36 +47,12 @@ from penumbra.kernels.penumbra_volume import (
     fill_volume,
     light_gap,
 )
-from penumbra.kernels.segment import segment_is_blocked
-from penumbra.kernels.shaft import box_outside_shaft, triangle_outside_shaft
+from penumbra.kernels.shaft import blockers_to_skip
 
 # What cast_blockers stopped for.
 DONE = np.int64(0)
 POOL_EMPTY = np.int64(1)
 REBUILD = np.int64(2)
-
-
-@inlined
-def _block_group(blocker, side, bvh, slot, light, group, n_samples, known, scratch, counters):
-    """Bits of one group that the blocker blocks for a receiver; `known` are blocked already."""
-    full = light.full_groups[group]
-    sample_set = np.int64(bvh.sample_set[slot])
-    first = group * n_samples
-    counters[SAMPLES_TESTED] += popcount64(full & ~known)
-    blocked, possible = test_samples(
-        scratch.edges, blocker.side == 0, light.parameters, sample_set, first, n_samples
-    )
-    left_open = possible & ~blocked & ~known & full
-    if left_open != ZERO:
-        counters[ESCALATED_F64] += popcount64(left_open)
-        x, y, z = bvh.points[slot, 0], bvh.points[slot, 1], bvh.points[slot, 2]
-        while left_open != ZERO:
-            lane = lowest_bit(left_open)
-            left_open &= left_open - ONE
-            point = light.points[sample_set, first + lane]
-            if segment_is_blocked(side, x, y, z, point[0], point[1], point[2], blocker.corners, counters):
-                blocked |= ONE << np.uint64(lane)
-    return blocked & full & ~known
 
 
 @helper
@@ -124,7 +98,10 @@ def _cast_on_receiver(blocker, slot, level, bvh, pool, light, group_size, switch
                 return group_filled
             counters[PAIRS_TESTED] += 1
             fill_edges(blocker, scratch.normal, side, x, y, z, light, light_norm, scratch.edges)
-        new = _block_group(blocker, side, bvh, slot, light, group, group_size, known, scratch, counters)
+        sample_set = np.int64(bvh.sample_set[slot])
+        new = ~known & block_group(
+            blocker, side, x, y, z, scratch.edges, light, sample_set, group, group_size, known, counters
+        )
         if new == ZERO:
             continue
         if place < 0:
@@ -300,17 +277,9 @@ def cast_blockers(chunk, start, rebuild_at, shaft, bvh, pool, light, group_size,
     n_blockers = chunk.ids.shape[0]
     t = np.int64(start)
     while t < n_blockers:
-        skip = np.int64(0)
-        if t & 4095 == 0 and box_outside_shaft(shaft, chunk.boxes_4096, t >> 12):
-            skip = np.int64(4096)
-        elif t & 255 == 0 and box_outside_shaft(shaft, chunk.boxes_256, t >> 8):
-            skip = np.int64(256)
-        elif t & 15 == 0 and box_outside_shaft(shaft, chunk.boxes_16, t >> 4):
-            skip = np.int64(16)
-        elif triangle_outside_shaft(shaft, chunk.vertices[t]):
-            skip = np.int64(1)
+        skip = blockers_to_skip(shaft, chunk, t)
         if skip > 0:
-            counters[BLOCKERS_CULLED] += min(skip, n_blockers - t)
+            counters[BLOCKERS_CULLED] += skip
             t += skip
             continue
         if not _cast_blocker(

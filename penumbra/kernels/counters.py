@@ -13,8 +13,11 @@ NAMES = (
     "umbra_groups_skipped",  # light sample groups left because they are blocked
     "pairs_tested",  # receiver x blocker pairs that reached the hard shadow volumes
     "samples_tested",  # receiver x blocker x sample triples decided, of samples not blocked before
-    "escalated_f64",  # of those, left open by float32 lanes
+    "escalated_f64",  # of those, left open by float32 lanes, or by the volume of a point light
     "escalated_exact",  # predicates decided in exact integers
+    "pairs_assigned",  # receiver x blocker pairs that share a cell of the grid (gears)
+    "pairs_blocking",  # pairs whose blocker blocks at least one sample (gears)
+    "pairs_covering",  # of those, pairs whose blocker was seen to block all samples at once (gears)
     "masks_allocated",  # masks taken from the pool
     "masks_released",  # masks given back because all is blocked
 )
@@ -33,6 +36,9 @@ NAMES = (
     SAMPLES_TESTED,
     ESCALATED_F64,
     ESCALATED_EXACT,
+    PAIRS_ASSIGNED,
+    PAIRS_BLOCKING,
+    PAIRS_COVERING,
     MASKS_ALLOCATED,
     MASKS_RELEASED,
 ) = range(len(NAMES))

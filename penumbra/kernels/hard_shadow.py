@@ -11,7 +11,8 @@ float32, with a bound; what falls inside the bound is decided by `segment`.
 import numpy as np
 
 from penumbra.kernels._jit import helper, inlined
-from penumbra.kernels.counters import ESCALATED_EXACT
+from penumbra.kernels.bits import ONE, ZERO, lowest_bit, popcount64
+from penumbra.kernels.counters import ESCALATED_EXACT, ESCALATED_F64, SAMPLES_TESTED
 from penumbra.kernels.lanes import bits_above, bits_not_below, lesser, load, splat
 from penumbra.kernels.penumbra_volume import cross
 from penumbra.kernels.predicates import (
@@ -23,14 +24,15 @@ from penumbra.kernels.predicates import (
     orient3d_exact,
     sign_of,
 )
+from penumbra.kernels.segment import segment_is_blocked
 
 # Lanes: coefficients scaled to at most 1, |s|, |t| <= 1/2. In units of 2**-24 the rounding of A, B, C
 # gives 2, of s and t 1, of the two products 1, of the two sums 3.5: 7.5, so 8.
 LANE_BOUND = np.float32(8.0 * 2.0**-24)
 # Float64 part: edge vectors 1, cross product 4, light vectors 1, dot product 3, of each term; doubled.
-_COEFFICIENT_BOUND = 20.0 * UNIT_ROUNDOFF
-_SMALLEST = 1e-250
-_LARGEST = 1e250
+EDGE_BOUND = 20.0 * UNIT_ROUNDOFF
+SMALLEST_EDGE = 1e-250
+LARGEST_EDGE = 1e250
 
 
 @helper
@@ -83,12 +85,12 @@ def light_side(tri, normal, light, extent):
 
 
 @inlined
-def _set_edge(k, a, b, c, error, edges):
+def set_edge(k, a, b, c, error, edges):
     """Store one function scaled to at most 1, with the bound of its lanes."""
     largest = max(max(abs(a), abs(b)), abs(c))
     # The sum is not finite where any of the three is not; a maximum may pass over a nan.
     total = abs(a) + abs(b) + abs(c)
-    if not (total > _SMALLEST and total < _LARGEST and error < _LARGEST):
+    if not (total > SMALLEST_EDGE and total < LARGEST_EDGE and error < LARGEST_EDGE):
         # Nothing is known: every lane is left open.
         edges[k, 0] = edges[k, 1] = edges[k, 2] = np.float32(0.0)
         edges[k, 3] = np.float32(np.inf)
@@ -111,7 +113,7 @@ def fill_edges(blocker, normal, side, x, y, z, light, light_norm, edges):
     u, v, o = light.edge_u, light.edge_v, light.origin
     gx, gy, gz = o[0] - x, o[1] - y, o[2] - z
     length = abs(gx) + abs(gy) + abs(gz) + light_norm
-    reach = _COEFFICIENT_BOUND * length + light.residual
+    reach = EDGE_BOUND * length + light.residual
     tiny = UNDERFLOW * (1.0 + length)
     flip = -float(side)
     for k in range(3):
@@ -121,7 +123,7 @@ def fill_edges(blocker, normal, side, x, y, z, light, light_norm, edges):
         nx, ny, nz = cross(wx, wy, wz, ex, ey, ez)
         nx, ny, nz = nx * flip, ny * flip, nz * flip
         size = (abs(wx) + abs(wy) + abs(wz)) * (abs(ex) + abs(ey) + abs(ez))
-        _set_edge(
+        set_edge(
             k,
             nx * gx + ny * gy + nz * gz,
             nx * u[0] + ny * u[1] + nz * u[2],
@@ -133,8 +135,8 @@ def fill_edges(blocker, normal, side, x, y, z, light, light_norm, edges):
         nx, ny, nz = normal[0] * flip, normal[1] * flip, normal[2] * flip
         hx, hy, hz = o[0] - tri[0, 0], o[1] - tri[0, 1], o[2] - tri[0, 2]
         length = abs(hx) + abs(hy) + abs(hz) + light_norm
-        reach = _COEFFICIENT_BOUND * length + light.residual
-        _set_edge(
+        reach = EDGE_BOUND * length + light.residual
+        set_edge(
             3,
             nx * hx + ny * hy + nz * hz,
             nx * u[0] + ny * u[1] + nz * u[2],
@@ -168,3 +170,39 @@ def test_samples(edges, straddles, parameters, sample_set, first, n_samples):
         blocked |= np.uint64(bits_above(f, above)) << np.uint64(row)
         possible |= np.uint64(bits_not_below(f, below)) << np.uint64(row)
     return blocked, possible
+
+
+@inlined
+def groups_reached(edges, boxes, first):
+    """Bits of 16 light sample groups, from `first` on, that a blocker may reach as seen from a receiver.
+
+    boxes (4, n) float32: centre s, t and half widths of each group in light parameters. Twice the bound of
+    the lanes: four products and four sums, of numbers that are at most 2.
+    """
+    s, t = load(boxes, first), load(boxes, boxes.shape[1] + first)
+    half_s, half_t = load(boxes, 2 * boxes.shape[1] + first), load(boxes, 3 * boxes.shape[1] + first)
+    reached = np.int64(0xFFFF)
+    for k in range(3):
+        a, b, c = edges[k, 0], edges[k, 1], edges[k, 2]
+        most = splat(a) + splat(b) * s + splat(c) * t + splat(abs(b)) * half_s + splat(abs(c)) * half_t
+        reached &= bits_not_below(most, splat(-(edges[k, 3] + LANE_BOUND)))
+    return reached
+
+
+@inlined
+def block_group(blocker, side, x, y, z, edges, light, sample_set, group, n_samples, known, counters):
+    """Bits of one group that the blocker blocks for a receiver; `known` are blocked already."""
+    full = light.full_groups[group]
+    first = group * n_samples
+    counters[SAMPLES_TESTED] += popcount64(full & ~known)
+    blocked, possible = test_samples(edges, blocker.side == 0, light.parameters, sample_set, first, n_samples)
+    left_open = possible & ~blocked & ~known & full
+    if left_open != ZERO:
+        counters[ESCALATED_F64] += popcount64(left_open)
+        while left_open != ZERO:
+            lane = lowest_bit(left_open)
+            left_open &= left_open - ONE
+            point = light.points[sample_set, first + lane]
+            if segment_is_blocked(side, x, y, z, point[0], point[1], point[2], blocker.corners, counters):
+                blocked |= ONE << np.uint64(lane)
+    return blocked & full

@@ -58,6 +58,19 @@ def _load(typingctx: Any, array: Any, offset: Any) -> tuple[Any, Codegen]:
 
 
 @intrinsic
+def _store(typingctx: Any, array: Any, offset: Any, value: Any) -> tuple[Any, Codegen]:
+    """Lanes into a C-contiguous array, from a flat element offset on."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        pointer = builder.bitcast(builder.gep(data, [args[1]]), _vector(context, value).as_pointer())
+        builder.store(args[2], pointer, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, value), codegen
+
+
+@intrinsic
 def _splat(typingctx: Any, value: Any) -> tuple[Any, Codegen]:
     """Lanes that all hold one value."""
     kind = _KINDS[value]
@@ -86,8 +99,19 @@ def _binary(build: Callable[[Any, Any, Any], Any]) -> Any:
     return apply
 
 
+@intrinsic
+def _pick(typingctx: Any, left: Any, right: Any, one: Any, other: Any) -> tuple[Any, Codegen]:
+    """Lanes of `one` where left > right, of `other` elsewhere."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[2], args[3])
+
+    return one(left, right, one, other), codegen
+
+
 _add = _binary(lambda b, x, y: b.fadd(x, y))
 _sub = _binary(lambda b, x, y: b.fsub(x, y))
+_div = _binary(lambda b, x, y: b.fdiv(x, y))
 _mul = _binary(lambda b, x, y: b.fmul(x, y))
 _lesser = _binary(lambda b, x, y: b.select(b.fcmp_ordered("<", x, y), x, y))
 _greater = _binary(lambda b, x, y: b.select(b.fcmp_ordered(">", x, y), x, y))
@@ -120,7 +144,12 @@ def _overload_operator(symbol: Any, apply: Any) -> None:
         return None
 
 
-for _symbol, _apply in ((operator.add, _add), (operator.sub, _sub), (operator.mul, _mul)):
+for _symbol, _apply in (
+    (operator.add, _add),
+    (operator.sub, _sub),
+    (operator.mul, _mul),
+    (operator.truediv, _div),
+):
     _overload_operator(_symbol, _apply)
 
 
@@ -134,6 +163,10 @@ if numba.config.DISABLE_JIT:
         """Lanes from a C-contiguous array, from a flat element offset on."""
         return array.reshape(-1)[offset : offset + (16 if array.dtype == np.float32 else 8)]
 
+    def store(array, offset, value):
+        """Lanes into a C-contiguous array, from a flat element offset on."""
+        array.reshape(-1)[offset : offset + len(value)] = value
+
     def splat(value):
         """Lanes that all hold one float32 or float64."""
         return np.full(16 if isinstance(value, np.float32) else 8, value)
@@ -146,6 +179,10 @@ if numba.config.DISABLE_JIT:
         """Greater of two vectors, by lane."""
         return np.maximum(left, right)
 
+    def pick(left, right, one, other):
+        """Lanes of `one` where left > right, of `other` elsewhere."""
+        return np.where(left > right, one, other)
+
     def bits_above(left, right):
         """Bit k is set where lane k of left > right; int64."""
         return _packed(left > right)
@@ -155,5 +192,5 @@ if numba.config.DISABLE_JIT:
         return _packed(left >= right)
 
 else:
-    load, splat, lesser, greater = _load, _splat, _lesser, _greater
-    bits_above, bits_not_below = _bits_above, _bits_not_below
+    load, store, splat, lesser, greater = _load, _store, _splat, _lesser, _greater
+    pick, bits_above, bits_not_below = _pick, _bits_above, _bits_not_below

@@ -100,6 +100,19 @@ def triangle_outside_shaft(shaft, tri):
     return False
 
 
+@helper
+def blockers_to_skip(shaft, chunk, t):
+    """How many blockers of a chunk, from t on, lie outside the shaft together: a run, one, or none."""
+    n_left = chunk.ids.shape[0] - t
+    if t & 4095 == 0 and box_outside_shaft(shaft, chunk.boxes_4096, t >> 12):
+        return min(np.int64(4096), n_left)
+    if t & 255 == 0 and box_outside_shaft(shaft, chunk.boxes_256, t >> 8):
+        return min(np.int64(256), n_left)
+    if t & 15 == 0 and box_outside_shaft(shaft, chunk.boxes_16, t >> 4):
+        return min(np.int64(16), n_left)
+    return np.int64(triangle_outside_shaft(shaft, chunk.vertices[t]))
+
+
 @kernel
 def runs_touch_shaft(shaft, boxes, out):
     """Set out (n,) to whether each of boxes (n, 2, 3) may touch the shaft."""

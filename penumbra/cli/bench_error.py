@@ -1,0 +1,109 @@
+"""`penumbra bench error`: error of visibility against samples and seconds."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from penumbra.cli import options
+from penumbra.cli.console import Console, result
+
+
+def _samples(_context: click.Context, _parameter: click.Parameter, value: str) -> tuple[int, ...]:
+    try:
+        numbers = tuple(int(word) for word in value.split(","))
+    except ValueError:
+        numbers = ()
+    if not numbers or min(numbers) < 1:
+        raise click.BadParameter(f"{value!r} is not a list of whole numbers: write it as 16,64,256")
+    return numbers
+
+
+_output = click.option(
+    "-o",
+    "--output",
+    metavar="FOLDER",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Also write error.json, error.csv and error.png (needs matplotlib) into this folder.",
+)
+_light = click.option(
+    "--light", metavar="NAME", help="The area light to measure (default: the first of the scene)."
+)
+_resolution = click.option(
+    "--resolution",
+    metavar="WxH",
+    callback=options.resolution_of,
+    default="320x240",
+    show_default=True,
+    help="Pixels whose visible points are the receivers, in place of the scene's.",
+)
+_sample_counts = click.option(
+    "--samples",
+    metavar="N,N,...",
+    callback=_samples,
+    default="16,32,64,128,256,512,1024",
+    show_default=True,
+    help="Numbers of light samples to measure.",
+)
+_reference = click.option(
+    "--reference",
+    metavar="N",
+    type=click.IntRange(min=2),
+    default=16384,
+    show_default=True,
+    help="Light samples of the reference; an even number.",
+)
+_backend = click.option(
+    "--backend",
+    "backends",
+    metavar="NAME",
+    multiple=True,
+    type=click.Choice([name for name in options.BACKENDS if name != "auto"]),
+    help="A backend to measure; may be given more than once (default: hpc and gears).",
+)
+
+
+@click.command()
+@options.scene_path
+@_output
+@_light
+@_resolution
+@_sample_counts
+@_reference
+@_backend
+@options.memory("4GiB")
+@options.threads
+@options.seed
+@options.overwrite
+@options.verbosity
+@click.pass_context
+def error(
+    context: click.Context,
+    /,
+    scene: Path,
+    output: Path | None,
+    memory: int | None,
+    overwrite: bool,
+    **settings: Any,
+) -> None:
+    """Measure how wrong visibility is with so many light samples, and what they cost.
+
+    Each backend casts the points that the camera sees with each number of samples, on a regular grid and
+    jittered, and is compared with a reference of many samples: errors, seconds, peak memory, and how fast
+    the error falls.
+
+    Example: penumbra bench error scene.toml -o measured --samples 16,64,256
+    """
+    from penumbra.measure.error import DEFAULT_BACKENDS, ErrorOptions, measure_error
+    from penumbra.measure.error_report import prepare_error_outputs
+
+    settings["backends"] = settings["backends"] or DEFAULT_BACKENDS
+    chosen = ErrorOptions(**settings)
+    paths = prepare_error_outputs(output, overwrite) if output is not None else []
+    with context.ensure_object(Console).progress() as progress:
+        report = measure_error(scene, chosen, memory=memory, process_limit=True, progress=progress)
+    if paths:
+        report.write(paths)
+    result(report)
+    for path in paths:
+        result(path)

@@ -1,0 +1,178 @@
+"""`penumbra bench stability`: scenes made to break shadow algorithms, judged bit by bit and timed.
+
+Every scene is cast by the backend "reference", which decides each bit by exact signs alone, and by every
+other backend; each bit in which a backend differs is wrong.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from penumbra.api import CastResult, backend_named, cast
+from penumbra.arrays import UInt64Array
+from penumbra.errors import SceneError
+from penumbra.executors.threads import resolve_threads, run_tasks
+from penumbra.measure.error import DEFAULT_BACKENDS
+from penumbra.measure.report import machine_facts
+from penumbra.measure.stability_cases import (
+    ORDINARY,
+    Case,
+    HardScene,
+    SceneSize,
+    cases_named,
+    hard_scene,
+)
+from penumbra.measure.stability_report import StabilityReport, StabilityRow, WrongBit
+from penumbra.progress import NullProgress, Progress
+
+JUDGE = "reference"
+
+# Casting then takes most of the time of `cast`, and the judge 0.1 s (ordinary) to 0.6 s a scene.
+SIZE = SceneSize(n_receivers=1024, n_blockers=128, n_samples=64)
+QUICK_SIZE = SceneSize(n_receivers=64, n_blockers=24, n_samples=16)
+
+# The powers of two move a scene without rounding, so that what is zero stays zero far from the origin.
+SCALES_AND_OFFSETS = (
+    *((scale, offset) for scale in (1e-6, 1.0, 1e6) for offset in (0.0, 1e4, 1e6)),
+    (2.0**-20, 1e6),
+    (2.0**20, 1e6),
+)
+
+_REPEATS = 5
+_REPEAT_SECONDS = 0.25
+# All times are divided by the ordinary scene's, which is the shortest.
+_ORDINARY_REPEATS = 25
+
+
+@dataclass(frozen=True)
+class StabilityOptions:
+    """What to judge."""
+
+    backends: Sequence[str] = DEFAULT_BACKENDS
+    cases: Sequence[str] = ()
+    """Names of cases; all when empty."""
+    seed: int = 0
+    quick: bool = False
+    """Small scenes: for a first look, and for tests."""
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "backends", tuple(dict.fromkeys(self.backends)))
+        for backend in self.backends:
+            backend_named(backend)
+        if JUDGE in self.backends or not self.backends:
+            raise SceneError(f"backend {JUDGE} is the judge: name at least one other, and not it")
+
+    @property
+    def size(self) -> SceneSize:
+        """Receivers, blockers and samples of every scene."""
+        return QUICK_SIZE if self.quick else SIZE
+
+
+def measure_stability(
+    options: StabilityOptions | None = None, progress: Progress | None = None
+) -> StabilityReport:
+    """Cast every case at every scale and offset with every backend, and judge it.
+
+    Wrong bits are reported and not raised. Raises SceneError for an unknown case, BackendError for an
+    unknown backend.
+    """
+    options = options or StabilityOptions()
+    progress = progress or NullProgress()
+    cases = cases_named(options.cases)
+    small, threads = hard_scene(ORDINARY, QUICK_SIZE), resolve_threads(options.threads)
+    for backend in (JUDGE, *options.backends):
+        _cast(small, backend)  # so that no kernel is compiled while the time is taken
+    ordinary = hard_scene(ORDINARY, options.size, options.seed)
+    ordinary_seconds = {
+        backend: _timed_cast(ordinary, backend, threads, _ORDINARY_REPEATS)[1] for backend in options.backends
+    }
+    progress.stage("stability", len(cases) * len(SCALES_AND_OFFSETS), "scenes")
+    rows = [row for case in cases for row in _judge_case(case, options, threads, ordinary_seconds, progress)]
+    return StabilityReport(
+        receivers=options.size.n_receivers,
+        blockers=options.size.n_blockers,
+        samples=options.size.n_samples,
+        scenes=len(cases) * len(SCALES_AND_OFFSETS),
+        seed=options.seed,
+        quick=options.quick,
+        threads=threads,
+        backends=tuple(options.backends),
+        cases={case.name: case.what for case in cases},
+        ordinary_cpu_seconds=ordinary_seconds,
+        rows=tuple(rows),
+        machine=machine_facts(),
+    )
+
+
+def _judge_case(
+    case: Case,
+    options: StabilityOptions,
+    threads: int,
+    ordinary_seconds: dict[str, float],
+    progress: Progress,
+) -> Iterator[StabilityRow]:
+    """Rows of all scales, offsets and backends of a case, in this order."""
+    scenes = [
+        hard_scene(case, options.size, options.seed, scale, offset) for scale, offset in SCALES_AND_OFFSETS
+    ]
+    # The judge is slow where much is exactly zero, and not timed: it may take all threads.
+    judged = run_tasks(lambda scene: _masks(_cast(scene, JUDGE)), scenes, threads)
+    for (scale, offset), scene, expected in zip(SCALES_AND_OFFSETS, scenes, judged, strict=True):
+        for backend in options.backends:
+            result, seconds = _timed_cast(scene, backend, threads)
+            counters: dict[str, Any] = result.stats.as_dict()
+            first, n_wrong = _compare(_masks(result), expected)
+            yield StabilityRow(
+                case=case.name,
+                scale=scale,
+                offset=offset,
+                backend=backend,
+                bits=options.size.n_bits,
+                wrong_bits=n_wrong,
+                escalated_f64=counters["escalated_f64"],
+                escalated_exact=counters["escalated_exact"],
+                cpu_seconds=seconds,
+                times_ordinary=seconds / ordinary_seconds[backend],
+                first_wrong=first,
+            )
+        progress.advance(1)
+
+
+def _cast(scene: HardScene, backend: str, threads: int = 1) -> CastResult:
+    return cast(scene.points, scene.triangles, scene.light, own=scene.own, backend=backend, threads=threads)
+
+
+def _timed_cast(
+    scene: HardScene, backend: str, threads: int, repeats: int = _REPEATS
+) -> tuple[CastResult, float]:
+    """The result, and the median processor time of a few casts (of fewer where they are slow)."""
+    seconds: list[float] = []
+    while len(seconds) < repeats and sum(seconds) < _REPEAT_SECONDS:
+        began = time.process_time()
+        result = _cast(scene, backend, threads)
+        seconds.append(time.process_time() - began)
+    return result, median(seconds)
+
+
+def _masks(result: CastResult) -> UInt64Array:
+    assert result.masks is not None
+    return result.masks
+
+
+def _compare(masks: UInt64Array, expected: UInt64Array) -> tuple[WrongBit | None, int]:
+    """The first wrong bit, and how many there are."""
+    wrong = masks ^ expected
+    n_wrong = int(np.bitwise_count(wrong).sum())
+    if not n_wrong:
+        return None, 0
+    receiver, word = np.argwhere(wrong)[0]
+    lowest = int(wrong[receiver, word]) & -int(wrong[receiver, word])
+    bit = lowest.bit_length() - 1
+    return WrongBit(
+        int(receiver), 64 * int(word) + bit, bool(int(expected[receiver, word]) & lowest)
+    ), n_wrong
