@@ -213,6 +213,9 @@ def _bound(corners, camera, grid, correct, box, work, rect):
     for k in range(n_corners):
         work[k, 0], work[k, 1], work[k, 2] = _to_frame(camera, corners[k, 0], corners[k, 1], corners[k, 2])
         nearest = min(nearest, work[k, 2])
+    # What reaches the depth of the light may hide it from receivers that are no deeper than the blocker.
+    if not nearest - camera.light[5] > 2.0 * error:
+        nearest = min(nearest, grid.box[2])
     # Outside the hull of light and receivers nothing is blocked.
     for axis in range(3):
         low = high = work[0, axis]

@@ -118,16 +118,16 @@ def _draw_by_seconds(axes: "Axes", report: "ErrorReport") -> None:
                 axes.annotate(
                     str(samples), *place, textcoords="offset points", ha=side, fontsize=7, color=_GREY
                 )
-    _label_seconds(axes, [row.cost.seconds for row in report.rows])
+    _label_seconds(axes)
     axes.legend(fontsize=8, title="small numbers: light samples", title_fontsize=8)
 
 
-def _label_seconds(axes: "Axes", seconds: list[float]) -> None:
+def _label_seconds(axes: "Axes") -> None:
     """Write plain numbers at the axis, the more of a decade the fewer decades there are."""
     from matplotlib.ticker import FuncFormatter, LogLocator
 
-    spread = max(seconds) / min(seconds)
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7) if spread < 10 else (1, 2, 5)))
+    low, high = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7) if high < 10 * low else (1, 2, 5)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.minorticks_off()
 
