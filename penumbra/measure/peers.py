@@ -4,7 +4,6 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from penumbra.io.atomic import temporary_folder
 from penumbra.measure.peer_case import CastCase
 from penumbra.measure.peers_report import Agreement, PeerReport, PeerRow
 from penumbra.measure.report import machine_facts
+from penumbra.measure.scaling_scenes import NamedScene
 from penumbra.measure.side_by_side import SideBySide, case_of
 from penumbra.progress import NullProgress, Progress
 from penumbra.scene import Scene
@@ -41,13 +41,6 @@ class PeerOptions:
     def __post_init__(self) -> None:
         backend_named(self.backend)
         object.__setattr__(self, "threads", resolve_threads(self.threads))
-
-
-class NamedScene(NamedTuple):
-    """A scene file and what its rows are called."""
-
-    name: str
-    path: Path
 
 
 def measure_peers(
@@ -79,7 +72,6 @@ def _measure_scene(named: NamedScene, options: PeerOptions, folder: Path, progre
             case = case_of(
                 scene,
                 blockers,
-                sides.store,
                 light=options.light,
                 samples=options.samples,
                 sets=options.sets,
@@ -89,7 +81,7 @@ def _measure_scene(named: NamedScene, options: PeerOptions, folder: Path, progre
         sides.load(case)
         progress.stage(f"{named.name}: cast and trace in turn", None, "")
         rounds = sides.measure(options.rounds)
-        ours, embree = sides.masks()
+        ours, embree = sides.our_masks(), sides.embree_masks()
         progress.stage(f"{named.name}: judge", None, "")
         agreement = _agreement(case, sides.store, ours, embree, options.judged)
     progress.close()

@@ -5,11 +5,11 @@ Run as `python -m penumbra.measure.penumbra_peer`; `peer_process` talks to it.
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 import penumbra
+from penumbra.arrays import UInt64Array
 from penumbra.compile_ahead import compile_ahead
 from penumbra.io.blocker_store import BlockerStore
 from penumbra.measure.peer_case import CastCase
@@ -25,6 +25,7 @@ class PenumbraPeer:
     """Our side: `penumbra.ingest` and `penumbra.cast`, as any caller has them."""
 
     _store: BlockerStore | None = None
+    _masks: UInt64Array | None = None
 
     def build(self, meshes: Sequence[Answer], store: str) -> Answer:
         """Ingest meshes (the fields of `MeshRef`) into a store, or open the store that they name."""
@@ -59,7 +60,8 @@ class PenumbraPeer:
     def cast(self, threads: int, backend: str, few: bool = False) -> Answer:
         """Cast all receivers once; `few`: only some, which loads the kernels."""
         case, rows = self._case, slice(_FEW if few else None)
-        found: dict[str, Any] = {}
+        # What the last cast found would hide a part of what this one needs.
+        self._masks = None
 
         def work() -> Answer:
             result = penumbra.cast(
@@ -72,15 +74,14 @@ class PenumbraPeer:
                 backend=backend,
                 threads=threads,
             )
-            found["masks"] = result.masks
+            self._masks = result.masks
             return {"stats": result.stats.as_dict()}
 
-        answer = costed(work)
-        self._masks = found["masks"]
-        return answer
+        return costed(work)
 
     def masks(self, path: str) -> Answer:
         """Save the bits of the last cast, uint64 (R, n_words)."""
+        assert self._masks is not None
         np.save(path, self._masks)
         return {}
 

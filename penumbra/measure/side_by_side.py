@@ -141,16 +141,20 @@ class SideBySide:
         best = min(embree, key=lambda flag: median(p.cpu_seconds for p in embree[flag])) if embree else True
         return Rounds(tuple(ours), tuple(embree.get(best, ())), best, n_rays, stats)
 
-    def masks(self) -> tuple[UInt64Array, UInt64Array]:
-        """Bits of the last pass of each side, uint64 (R, n_words)."""
-        if self._embree is None:
-            raise BackendError("Embree was not asked to run: there are no bits to compare with")
-        found = []
-        for name, side in (("ours", self._ours), ("embree", self._embree)):
-            path = self._folder / f"masks-{name}.npy"
-            side.ask("masks", path=str(path))
-            found.append(np.load(path))
-        return found[0], found[1]
+    def our_masks(self) -> UInt64Array:
+        """Bits of our last pass, uint64 (R, n_words)."""
+        return self._masks(self._ours)
+
+    def embree_masks(self) -> UInt64Array:
+        """Bits of Embree's last pass, uint64 (R, n_words)."""
+        assert self._embree is not None
+        return self._masks(self._embree)
+
+    def _masks(self, side: PeerProcess) -> UInt64Array:
+        path = self._folder / "masks.npy"
+        side.ask("masks", path=str(path))
+        masks: UInt64Array = np.load(path)
+        return masks
 
     def _cast_embree(self, is_coherent: bool, samples: int = 0) -> Answer:
         assert self._embree is not None
@@ -160,7 +164,6 @@ class SideBySide:
 def case_of(
     scene: Scene,
     blockers: Blockers,
-    store: Path,
     *,
     light: str | None = None,
     samples: int | None = None,
@@ -168,12 +171,12 @@ def case_of(
     resolution: tuple[int, int] | None = None,
     threads: int = 0,
 ) -> CastCase:
-    """The receivers that `render` casts for a scene whose geometry is in a store, and one of its lights.
+    """The receivers that `render` casts for a scene whose blockers these are, and one of its lights.
 
     light: its name, the first area light by default; samples, sets, resolution: in place of the scene's.
     """
     scene = scene.with_overrides(resolution=resolution, samples=samples)
-    chosen = chosen_light(replace(scene, geometry=(MeshRef(store),)), light)
+    chosen = chosen_light(scene, light)
     if sets is not None:
         chosen = replace(chosen, sets=sets)
     width, height = scene.camera.resolution
