@@ -4,6 +4,7 @@ Each side of a comparison gets its own process, so that its processor time and p
 Embree's floating-point modes stay with Embree.
 """
 
+import contextlib
 import json
 import os
 import subprocess
@@ -42,10 +43,13 @@ class PeerProcess:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if value is None and self._child.stdin is not None:
-            self._child.stdin.close()
-        else:
+        if value is not None:
             self._child.kill()
+        for stream in (self._child.stdin, self._child.stdout):
+            assert stream is not None
+            # What a dead child has not read is of no use to anybody.
+            with contextlib.suppress(BrokenPipeError):
+                stream.close()
         self._child.wait()
 
     def ask(self, command: str, **arguments: Any) -> Answer:

@@ -99,13 +99,13 @@ def turned(profile: Sequence[tuple[float, float]], sides: int) -> Float64Array:
 
 
 def box(low: ArrayLike, high: ArrayLike) -> Float64Array:
-    """An axis-aligned box, (12, 3, 3)."""
+    """An axis-aligned box, (12, 3, 3), its normals outwards."""
     low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
     faces = []
     for axis in range(3):
         u, v = np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3]]
         square = np.array([[0 * u, u], [v, u + v]])
-        faces += [sheet(low + square * (high - low)), sheet(high - square * (high - low))]
+        faces += [sheet(low + square * (high - low)), sheet(high - square.swapaxes(0, 1) * (high - low))]
     return np.concatenate(faces)
 
 
