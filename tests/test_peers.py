@@ -19,6 +19,8 @@ from penumbra.errors import BackendError
 from penumbra.ingest import blockers_in_memory
 from penumbra.lights import sample_sets_of
 from penumbra.measure import side_by_side
+from penumbra.measure.equal_error import EqualError, Estimate
+from penumbra.measure.mitsuba_peer import is_installed
 from penumbra.measure.peer_case import CastCase, write_indexed_mesh
 from penumbra.measure.peer_process import PeerProcess
 
@@ -193,3 +195,27 @@ def test_without_embree_there_is_one_sentence(
 def test_unknown_scene(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["-q", "bench", "peers", "meadow"]) == 1
     assert "'meadow'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("slope", [-0.5, -0.75])
+def test_seconds_to_equal_error_follow_the_power_law(slope: float) -> None:
+    estimates = tuple(Estimate(n, 2.0 * n**slope, 0.1 * n, 0.06 * n) for n in (64, 256, 1024))
+    found = EqualError("3", 2.0 * 400**slope, estimates)
+    assert found.seconds("cpu_seconds") == pytest.approx(40.0)
+    assert found.seconds("wall_seconds") == pytest.approx(24.0)
+    assert EqualError("3", 1e-9, estimates).seconds("cpu_seconds") is None
+    assert EqualError("3", 1.0, estimates).seconds("cpu_seconds") == pytest.approx(6.4)
+
+
+@needs_embree
+def test_mitsuba_sees_what_we_see(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["-q", "bench", "peers", str(scene_file), "--rounds", "1", "--samples", "64", "--mitsuba"]
+    assert run(arguments) == 0
+    out = capsys.readouterr().out
+    if not is_installed():
+        assert "Mitsuba is not installed" in out
+        return
+    table = out.split("until its error is ours\n")[1].splitlines()
+    our_rms, its_rms = (float(table[1].split()[column]) for column in (1, 4))
+    # As many samples of the same kind err by as much; a systematic difference would not go away.
+    assert 0 < its_rms < 1.5 * our_rms < 0.1

@@ -44,6 +44,12 @@ _judged = click.option(
     help="Receivers with differing bits that exact brute force decides.",
 )
 
+_mitsuba = click.option(
+    "--mitsuba",
+    is_flag=True,
+    help="Also measure how long Mitsuba 3 takes to an error like ours (if installed).",
+)
+
 
 @click.command()
 @scenes
@@ -54,6 +60,7 @@ _judged = click.option(
 @light
 @rounds
 @_judged
+@_mitsuba
 @options.backend
 @options.threads
 @options.scratch

@@ -105,7 +105,8 @@ def _set_float_control(typingctx: Any, word: Any) -> Any:
 def _clear_padding(words, n_samples):
     """Clear the bits beyond the samples in the last word of a mask."""
     in_last = n_samples - 64 * (words.shape[0] - 1)
-    if in_last < 64:
+    # A pass over fewer samples may end before the last word, where there is nothing to clear.
+    if 0 < in_last < 64:
         words[-1] &= (ONE << np.uint64(in_last)) - ONE
 
 

@@ -1,7 +1,7 @@
 """What both sides of a comparison are given: the same receivers, light samples and triangles, as files."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,6 @@ from penumbra.blockers import Blockers
 from penumbra.lights import RectLight
 
 _ARRAYS = ("points", "normals", "own", "index")
-_LIGHT_FIELDS = ("samples", "sets", "seed", "two_sided")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +37,8 @@ class CastCase:
         """Write arrays and numbers into a folder that exists."""
         for name in _ARRAYS:
             np.save(folder / f"{name}.npy", getattr(self, name))
-        light: dict[str, Any] = {name: getattr(self.light, name) for name in _LIGHT_FIELDS}
-        light |= {name: getattr(self.light, name).tolist() for name in ("corner", "edge_u", "edge_v")}
+        light = {field.name: getattr(self.light, field.name) for field in fields(self.light)}
+        light |= {name: value.tolist() for name, value in light.items() if isinstance(value, np.ndarray)}
         numbers = {"width": self.width, "offset": self.offset, "light": light}
         (folder / "case.json").write_text(json.dumps(numbers))
 

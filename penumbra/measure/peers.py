@@ -11,6 +11,7 @@ from penumbra.api import backend_named, cast, visible_fraction
 from penumbra.arrays import UInt64Array
 from penumbra.executors.threads import resolve_threads
 from penumbra.io.atomic import temporary_folder
+from penumbra.measure.equal_error import measure_equal_error
 from penumbra.measure.peer_case import CastCase
 from penumbra.measure.peers_report import Agreement, PeerReport, PeerRow
 from penumbra.measure.report import machine_facts
@@ -37,6 +38,8 @@ class PeerOptions:
     backend: str = "auto"
     judged: int = 16
     """Receivers with disagreeing bits that exact brute force decides."""
+    mitsuba: bool = False
+    """Also measure how long Mitsuba takes to an error like ours, where it is installed."""
 
     def __post_init__(self) -> None:
         backend_named(self.backend)
@@ -59,7 +62,9 @@ def measure_peers(
         # A process for each scene: what one leaves in memory would count as the next one's.
         with temporary_folder(scratch or Path(tempfile.gettempdir())) as folder:
             rows.append(_measure_scene(scene, options, folder, progress))
-    return PeerReport(tuple(rows), options.threads, options.backend, options.rounds, machine_facts())
+    return PeerReport(
+        tuple(rows), options.threads, options.backend, options.rounds, machine_facts(), options.mitsuba
+    )
 
 
 def _measure_scene(named: NamedScene, options: PeerOptions, folder: Path, progress: Progress) -> PeerRow:
@@ -84,8 +89,13 @@ def _measure_scene(named: NamedScene, options: PeerOptions, folder: Path, progre
         ours, embree = sides.our_masks(), sides.embree_masks()
         progress.stage(f"{named.name}: judge", None, "")
         agreement = _agreement(case, sides.store, ours, embree, options.judged)
+    equal = None
+    if options.mitsuba:
+        progress.stage(f"{named.name}: Mitsuba to equal error", None, "")
+        visibility = visible_fraction(ours, case.light.samples).astype(np.float64)
+        equal = measure_equal_error(case, sides.store, folder, visibility, options.threads)
     progress.close()
-    return PeerRow(named.name, case.facts(), ingest, build, rounds, agreement)
+    return PeerRow(named.name, case.facts(), ingest, build, rounds, agreement, equal)
 
 
 def _agreement(case: CastCase, store: Path, ours: UInt64Array, embree: UInt64Array, judged: int) -> Agreement:

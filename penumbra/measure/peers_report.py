@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import geometric_mean
+from statistics import geometric_mean, median
 from typing import Any, NamedTuple
 
+from penumbra.measure.equal_error import EqualError
 from penumbra.measure.peer_process import Answer
 from penumbra.measure.report import aligned_table, prepare_outputs, write_csv, write_json
 from penumbra.measure.side_by_side import Rounds, Spread
@@ -42,6 +43,8 @@ class PeerRow(NamedTuple):
     """What Embree's build took."""
     rounds: Rounds
     agreement: Agreement
+    equal: EqualError | None = None
+    """Mitsuba's way to our error; None where it was not asked for, or is not installed."""
 
     def as_dict(self) -> dict[str, Any]:
         """One flat row, as in the CSV file."""
@@ -61,6 +64,7 @@ class PeerRow(NamedTuple):
             flat[f"ingest_{key}"] = self.ingest.get(key)
         for key in ("seconds", "cpu_seconds", "added_bytes", "own_bytes", "own_peak_bytes", "mesh_bytes"):
             flat[f"build_{key}"] = self.build[key]
+        flat |= self.equal.as_dict() if self.equal is not None else {}
         return flat | self.rounds.stats
 
     @property
@@ -116,6 +120,23 @@ class PeerRow(NamedTuple):
             _number(self.build["own_peak_bytes"], n, ".0f"),
         ]
 
+    def equal_cells(self) -> list[str]:
+        """The row of the table of equal error."""
+        assert self.equal is not None
+        ours = median(one.cpu_seconds for one in self.rounds.ours)
+        cpu, wall = (self.equal.seconds(what) for what in ("cpu_seconds", "wall_seconds"))
+        last = self.equal.estimates[-1]
+        return [
+            self.name,
+            f"{self.equal.our_rms:.5f}",
+            f"{ours:.3f}",
+            f"{last.samples}",
+            f"{last.rms:.5f}",
+            _number(cpu, 1, ".3f"),
+            _number(wall, 1, ".3f"),
+            _number(cpu, ours, ".2f"),
+        ]
+
     def stage_cells(self, stages: Sequence[str]) -> list[str]:
         """The row of the table of our stages, wall seconds."""
         return [self.name, *(_number(self.rounds.stats.get(stage), 1, ".3f") for stage in stages)]
@@ -130,6 +151,8 @@ class PeerReport:
     backend: str
     n_rounds: int
     machine: dict[str, Any]
+    with_mitsuba: bool = False
+    """Whether Mitsuba was asked for."""
 
     @property
     def mean_cpu_ratio(self) -> float:
@@ -144,6 +167,7 @@ class PeerReport:
             "n_rounds": self.n_rounds,
             "embree": self.rows[0].build["version"],
             "native_packets": self.rows[0].build["native_packets"],
+            "mitsuba": self._mitsuba_version,
             "mean_cpu_ratio": self.mean_cpu_ratio,
             "machine": self.machine,
             "rows": [row.as_dict() for row in self.rows],
@@ -163,7 +187,8 @@ class PeerReport:
 
     def __str__(self) -> str:
         """Return what was measured as lines and tables of text."""
-        tables = (self._speed(), self._stages(), self._bits(), self._builds())
+        tables = [self._speed(), self._stages(), self._bits(), self._builds()]
+        tables += [self._equal_errors()] if self.with_mitsuba else []
         return "\n\n".join((self._facts(), *tables))
 
     def _facts(self) -> str:
@@ -206,6 +231,18 @@ class PeerReport:
         return "getting ready: our ingest and memory of a cast, Embree's build\n" + aligned_table(
             header, [row.build_cells() for row in self.rows]
         )
+
+    @property
+    def _mitsuba_version(self) -> str | None:
+        return next((row.equal.version for row in self.rows if row.equal is not None), None)
+
+    def _equal_errors(self) -> str:
+        if self._mitsuba_version is None:
+            return "Mitsuba is not installed"
+        header = ("scene", "our RMS error", "our cpu s", "its samples", "its RMS error", "cpu s to our error",
+                  "wall s", "cpu ratio")  # fmt: skip
+        title = f"Mitsuba {self._mitsuba_version} (llvm), shadow rays alone, until its error is ours"
+        return f"{title}\n" + aligned_table(header, [row.equal_cells() for row in self.rows])
 
 
 def prepare_peer_outputs(folder: Path, overwrite: bool) -> list[Path]:
