@@ -10,6 +10,7 @@ import numpy as np
 
 from penumbra.arrays import Float64Array
 from penumbra.io.atomic import atomic_path
+from penumbra.io.ply_writer import write_ply
 
 SCENE_NAME = "demo.toml"
 MESH_NAME = "demo.ply"
@@ -73,8 +74,12 @@ _QUAD = [(0, 1, 2), (0, 2, 3)]
 
 def write_demo_scene(folder: Path) -> Path:
     """Write the mesh (PLY) and the scene file into a folder; returns the path of the scene file."""
-    with atomic_path(folder / MESH_NAME) as temporary:
-        temporary.write_bytes(_ply(demo_triangles()))
+    # Vertices are shared, and told apart as they are written.
+    corners = demo_triangles().reshape(-1, 3).astype(np.float32)
+    vertices, inverse = np.unique(corners, axis=0, return_inverse=True)
+    write_ply(
+        folder / MESH_NAME, vertices, inverse.reshape(-1, 3), "the demo scene of penumbra, metres, y up"
+    )
     with atomic_path(folder / SCENE_NAME) as temporary:
         temporary.write_text(SCENE_TEXT)
     return folder / SCENE_NAME
@@ -221,20 +226,6 @@ def _unit_sphere(subdivisions: int) -> Float64Array:
         triangles = np.concatenate([np.stack(corner, axis=1) for corner in corners])
         triangles /= np.linalg.norm(triangles, axis=2, keepdims=True)
     return triangles
-
-
-def _ply(triangles: Float64Array) -> bytes:
-    """A binary PLY file, vertices shared and rounded to float32."""
-    corners = triangles.reshape(-1, 3).astype("<f4")
-    vertices, inverse = np.unique(corners, axis=0, return_inverse=True)
-    faces = np.empty(len(triangles), dtype=[("n", "u1"), ("vertex", "<i4", 3)])
-    faces["n"], faces["vertex"] = 3, inverse.reshape(-1, 3)
-    header = (
-        "ply\nformat binary_little_endian 1.0\ncomment the demo scene of penumbra, metres, y up\n"
-        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    return header.encode() + vertices.tobytes() + faces.tobytes()
 
 
 # Corners in the order of the bits of their index (x, y, z), and the six faces of the unit box.

@@ -21,7 +21,7 @@ THIRD_PARTY_HOMES = {
     "PIL": "io/png.py",
     "click": "cli/",
     "trimesh": "io/other_formats.py",
-    "matplotlib": "measure/plots.py",
+    "matplotlib": "measure/plots",
 }
 HEAVY = ("numba", "llvmlite", "h5py", "trimesh", "OpenEXR", "PIL", "matplotlib")
 

@@ -4,6 +4,8 @@ import click
 
 from penumbra.cli import options
 from penumbra.cli.bench_error import error
+from penumbra.cli.bench_peers import peers
+from penumbra.cli.bench_scaling import scaling
 from penumbra.cli.bench_stability import stability
 
 
@@ -18,5 +20,5 @@ def bench() -> None:
     """
 
 
-for _command in (error, stability):
+for _command in (error, stability, peers, scaling):
     bench.add_command(_command)

@@ -1,4 +1,4 @@
-"""Plots of measurements as PNG; the only file that needs matplotlib, which it imports when it draws."""
+"""Plots of measurements as PNG; matplotlib is imported when they are drawn."""
 
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -32,7 +32,7 @@ def require_matplotlib() -> None:
 
 def draw_error(report: "ErrorReport", path: Path) -> None:
     """Draw RMS error against samples, with fits and theory, and against seconds for each backend."""
-    figure, (by_samples, by_seconds) = _new_figure(2)
+    figure, (by_samples, by_seconds) = new_figure(2)
     width, height = report.resolution
     figure.suptitle(
         f"{report.scene}, light {report.light}: {report.n_receivers:,} receivers at {width} × {height}, "
@@ -46,7 +46,7 @@ def draw_error(report: "ErrorReport", path: Path) -> None:
     else:
         _draw_by_samples(by_samples, report)
         _draw_by_seconds(by_seconds, report)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_by_samples(axes: "Axes", report: "ErrorReport") -> None:
@@ -145,7 +145,7 @@ def _looks() -> Iterator[tuple[str, str]]:
     return zip(COLOURS, MARKERS, strict=True)
 
 
-def _new_figure(n_panels: int) -> "tuple[Figure, list[Axes]]":
+def new_figure(n_panels: int) -> "tuple[Figure, list[Axes]]":
     """Make a figure with panels side by side, drawn by Agg and known to no global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -155,6 +155,7 @@ def _new_figure(n_panels: int) -> "tuple[Figure, list[Axes]]":
     return figure, [figure.add_subplot(1, n_panels, panel + 1) for panel in range(n_panels)]
 
 
-def _save(figure: "Figure", path: Path) -> None:
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write a figure as PNG, whole or not at all."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
