@@ -17,6 +17,13 @@ NAMES = (
     "escalated_exact",  # predicates decided in exact integers
     "masks_allocated",  # masks taken from the pool
     "masks_released",  # masks given back because all is blocked
+    "leaves_visited",  # leaf of receivers x chunk x block of samples that the joint descent entered
+    "tree_nodes_visited",  # leaf of receivers x node of a chunk's hierarchy
+    "clusters_visited",  # leaf of receivers x cluster of 16 blockers
+    "cluster_pairs",  # receiver x cluster pairs set up
+    "triangle_major",  # of those, tested one blocker against 16 samples at a time
+    "pairs_escalated",  # receiver x blocker pairs decided in world space
+    "lanes_tested",  # receiver x blocker x sample lanes of the joint descent
 )
 (
     BLOCKERS_TESTED,
@@ -35,5 +42,12 @@ NAMES = (
     ESCALATED_EXACT,
     MASKS_ALLOCATED,
     MASKS_RELEASED,
+    LEAVES_VISITED,
+    TREE_NODES_VISITED,
+    CLUSTERS_VISITED,
+    CLUSTER_PAIRS,
+    TRIANGLE_MAJOR,
+    PAIRS_ESCALATED,
+    LANES_TESTED,
 ) = range(len(NAMES))
 N_COUNTERS = len(NAMES)

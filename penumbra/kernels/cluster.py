@@ -1,0 +1,271 @@
+"""One receiver against a cluster of 16 blockers in light space, one blocker a lane.
+
+Seen from receiver r, edge k of a blocker is the function n_k . (l - r) of sample l, n_k = (v_k - r) x e_k.
+Sample l is blocked where all three have the sign of (v - r) . (v_1 - v_0) x (v_2 - v_1): then the line
+r l meets the blocker, and meets it ahead of r; and before l, since a fast lane lies wholly in front of the light. 
+
+Rounding, in units of u = 2**-24 times (|w| + E) E G, w = v_0 - r, E the length of the edges, G >= |l - r|:
+w 2.1 and its edge 1, products and difference 2 give 5.2 for n_0 and n_2; n_1 = N - n_0 - n_2 adds them,
+N and two roundings: 13.4; the function adds 6 for its own products and sums, s and t: below 20, of the
+32 that are allowed for. The error of places in light space beyond that is `doubt`, added to |w|.
+"""
+
+import numpy as np
+
+from penumbra.kernels._jit import helper, inlined
+from penumbra.kernels.bits import ONE, ZERO, lowest_bit, popcount64
+from penumbra.kernels.borrow import borrow
+from penumbra.kernels.counters import (
+    CLUSTER_PAIRS,
+    ESCALATED_F64,
+    LANES_TESTED,
+    PAIRS_ESCALATED,
+    TRIANGLE_MAJOR,
+)
+from penumbra.kernels.hard_shadow import fill_normal, receiver_side
+from penumbra.kernels.lanes import (
+    bits_above,
+    bits_not_below,
+    greater,
+    lesser,
+    load,
+    magnitude,
+    muladd,
+    pick,
+    splat,
+    store,
+    with_sign,
+)
+from penumbra.kernels.light_space import N_LANES
+from penumbra.kernels.segment import segment_is_blocked
+
+_ROUNDOFF = 2.0**-24
+_NEVER = np.float32(-1e30)
+_TINY = np.float32(1e-30)
+_LANE = np.uint64(0xFFFF)
+_ALL = np.int64(0xFFFF)
+
+
+@helper
+def decide_lane(tree, leaves, light, block, cluster, lane, row, word, candidates, scratch, counters):
+    """Which candidates of a word one blocker blocks, decided in world space: float64, then exactly."""
+    tree, leaves, light = borrow(tree), borrow(leaves), borrow(light)
+    scratch, counters = borrow(scratch), borrow(counters)
+    t = cluster * 16 + lane
+    if tree.ids[t] == leaves.own[row]:
+        return ZERO
+    tri = tree.vertices[t]
+    x, y, z = leaves.points[row, 0], leaves.points[row, 1], leaves.points[row, 2]
+    fill_normal(tri, scratch.normal)
+    side = receiver_side(tri, scratch.normal, x, y, z, counters)
+    if side == 0:
+        return ZERO
+    sample_set = np.int64(leaves.sample_set[row])
+    counters[ESCALATED_F64] += popcount64(candidates)
+    blocked = ZERO
+    while candidates != ZERO:
+        bit = lowest_bit(candidates)
+        candidates &= candidates - ONE
+        point = light.points[sample_set, block * 256 + word * 64 + bit]
+        if segment_is_blocked(side, x, y, z, point[0], point[1], point[2], tri, counters):
+            blocked |= ONE << np.uint64(bit)
+    return blocked
+
+
+@inlined
+def decide_lanes(tree, leaves, light, block, cluster, lanes, row, slot, scratch, counters):
+    """Decide whole blockers in world space, for all candidates that are open."""
+    while lanes != 0:
+        lane = lowest_bit(np.uint64(lanes))
+        lanes &= lanes - 1
+        counters[PAIRS_ESCALATED] += 1
+        for word in range(4):
+            candidates = scratch.wanted[word] & scratch.open[slot, word]
+            if candidates != ZERO:
+                scratch.open[slot, word] &= ~decide_lane(
+                    tree, leaves, light, block, cluster, lane, row, word, candidates, scratch, counters
+                )
+
+
+@inlined
+def _sure_bit(tree, leaves, light, block, cluster, row, word, bit, sure, possible, scratch, counters):
+    """Whether one sample is blocked by a lane that is sure of it, or by one that is not."""
+    own = leaves.own[row]
+    left_open = possible & ~sure
+    while sure != 0:
+        lane = lowest_bit(np.uint64(sure))
+        if tree.ids[cluster * 16 + lane] != own:
+            return True
+        sure &= sure - 1
+    while left_open != 0:
+        lane = lowest_bit(np.uint64(left_open))
+        left_open &= left_open - 1
+        if (
+            decide_lane(
+                tree, leaves, light, block, cluster, lane, row, word, ONE << np.uint64(bit), scratch, counters
+            )
+            != ZERO
+        ):
+            return True
+    return False
+
+
+@inlined
+def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, counters):
+    """Clear the open samples of a receiver that a cluster blocks, of those in scratch.wanted.
+
+    rect: least s, least t, greatest s, greatest t of the samples wanted.
+    """
+    row = leaves.row[leaf * 16 + slot]
+    counters[CLUSTER_PAIRS] += 1
+    first = cluster * (N_LANES * 16)
+    lanes = tree.lanes
+    rx, ry, rz = leaves.high[leaf, 0, slot], leaves.high[leaf, 1, slot], leaves.high[leaf, 2, slot]
+    lx, ly, lz = leaves.low[leaf, 0, slot], leaves.low[leaf, 1, slot], leaves.low[leaf, 2, slot]
+    wx = (load(lanes, first) - splat(rx)) + (load(lanes, first + 48) - splat(lx))
+    wy = (load(lanes, first + 16) - splat(ry)) + (load(lanes, first + 64) - splat(ly))
+    wz = (load(lanes, first + 32) - splat(rz)) + (load(lanes, first + 80) - splat(lz))
+    nx, ny, nz = load(lanes, first + 192), load(lanes, first + 208), load(lanes, first + 224)
+    height = muladd(wx, nx, muladd(wy, ny, wz * nz))
+    doubt = splat(np.float32(light.doubt))
+    size = (magnitude(wx) + magnitude(wy)) + (magnitude(wz) + doubt)
+    length = load(lanes, first + 240)
+    unsure = size * load(lanes, first + 256) * splat(np.float32(8.0 * _ROUNDOFF)) + splat(_TINY)
+    fast = np.int64(tree.fast[cluster])
+    sided = bits_above(magnitude(height), unsure) & fast
+    # Turn each blocker so that it is seen from its back, without a branch.
+    turn = with_sign(splat(np.float32(1.0)), height)
+    wx, wy, wz = wx * turn, wy * turn, wz * turn
+    nx, ny, nz = nx * turn, ny * turn, nz * turn
+    ex, ey, ez = load(lanes, first + 96), load(lanes, first + 112), load(lanes, first + 128)
+    b0, c0, d0 = wy * ez - wz * ey, wz * ex - wx * ez, wx * ey - wy * ex
+    ex, ey, ez = load(lanes, first + 144), load(lanes, first + 160), load(lanes, first + 176)
+    b2, c2, d2 = wy * ez - wz * ey, wz * ex - wx * ez, wx * ey - wy * ex
+    b1, c1, d1 = (nx - b0) - b2, (ny - c0) - c2, (nz - d0) - d2
+    gx, gy, gz = splat(-rx), splat(-ry), splat(-rz)
+    a0 = muladd(b0, gx, muladd(c0, gy, d0 * gz))
+    a1 = muladd(b1, gx, muladd(c1, gy, d1 * gz))
+    a2 = muladd(b2, gx, muladd(c2, gy, d2 * gz))
+    reach = abs(rx) + abs(ry) + abs(rz) + np.float32(1.0)
+    factor = np.float32(np.float32(32.0 * _ROUNDOFF) * reach + np.float32(4.0 * light.residual))
+    bound = (size + length) * length * splat(factor) + splat(_TINY)
+    below = splat(np.float32(0.0)) - bound
+
+    n_wanted = (
+        popcount64(scratch.wanted[0])
+        + popcount64(scratch.wanted[1])
+        + popcount64(scratch.wanted[2])
+        + popcount64(scratch.wanted[3])
+    )
+    s0, t0, s1, t1 = splat(rect[0]), splat(rect[1]), splat(rect[2]), splat(rect[3])
+    alive = _ALL
+    if n_wanted > 6 or sided != fast:
+        # The most and the least that each function reaches among the samples wanted.
+        most = lesser(
+            lesser(
+                a0 + greater(b0 * s0, b0 * s1) + greater(c0 * t0, c0 * t1),
+                a1 + greater(b1 * s0, b1 * s1) + greater(c1 * t0, c1 * t1),
+            ),
+            a2 + greater(b2 * s0, b2 * s1) + greater(c2 * t0, c2 * t1),
+        )
+        alive = bits_not_below(most, below - bound)
+        if sided != fast:
+            least = greater(
+                greater(
+                    a0 + lesser(b0 * s0, b0 * s1) + lesser(c0 * t0, c0 * t1),
+                    a1 + lesser(b1 * s0, b1 * s1) + lesser(c1 * t0, c1 * t1),
+                ),
+                a2 + lesser(b2 * s0, b2 * s1) + lesser(c2 * t0, c2 * t1),
+            )
+            askew = (alive | bits_not_below(bound + bound, least)) & fast & ~sided
+            if askew != 0:
+                decide_lanes(tree, leaves, light, block, cluster, askew, row, slot, scratch, counters)
+        alive &= sided
+        if alive == 0:
+            return
+    a0 = pick(sided, a0, splat(_NEVER))
+    sample_set = np.int64(leaves.sample_set[row])
+    parameters = light.parameters
+    at_s = (sample_set * light.tables.shape[1] + block) * 512
+    n_alive = popcount64(np.uint64(alive))
+    if n_wanted > 10 and n_alive * 24 < n_wanted * 2:
+        counters[TRIANGLE_MAJOR] += 1
+        coefficients = scratch.coefficients
+        store(coefficients, 0, a0)
+        store(coefficients, 16, b0)
+        store(coefficients, 32, c0)
+        store(coefficients, 48, a1)
+        store(coefficients, 64, b1)
+        store(coefficients, 80, c1)
+        store(coefficients, 96, a2)
+        store(coefficients, 112, b2)
+        store(coefficients, 128, c2)
+        store(coefficients, 144, bound)
+        while alive != 0:
+            lane = lowest_bit(np.uint64(alive))
+            alive &= alive - 1
+            _cast_lane(tree, leaves, light, block, cluster, lane, row, slot, at_s, scratch, counters)
+        return
+    counters[LANES_TESTED] += n_wanted * 16
+    for word in range(4):
+        wanted = scratch.wanted[word]
+        if wanted == ZERO:
+            continue
+        blocked = ZERO
+        while wanted != ZERO:
+            bit = lowest_bit(wanted)
+            wanted &= wanted - ONE
+            s = splat(parameters[sample_set, block, 0, word * 64 + bit])
+            t = splat(parameters[sample_set, block, 1, word * 64 + bit])
+            f = lesser(
+                lesser(muladd(b0, s, muladd(c0, t, a0)), muladd(b1, s, muladd(c1, t, a1))),
+                muladd(b2, s, muladd(c2, t, a2)),
+            )
+            possible = bits_not_below(f, below)
+            if possible != 0:
+                sure = bits_above(f, bound)
+                if _sure_bit(
+                    tree, leaves, light, block, cluster, row, word, bit, sure, possible, scratch, counters
+                ):
+                    blocked |= ONE << np.uint64(bit)
+        if blocked != ZERO:
+            scratch.open[slot, word] &= ~blocked
+
+
+@inlined
+def _cast_lane(tree, leaves, light, block, cluster, lane, row, slot, at_s, scratch, counters):
+    """Test one blocker against the samples wanted, 16 at a time."""
+    c = scratch.coefficients
+    parameters = light.parameters
+    a0, b0, c0 = splat(c[0, lane]), splat(c[1, lane]), splat(c[2, lane])
+    a1, b1, c1 = splat(c[3, lane]), splat(c[4, lane]), splat(c[5, lane])
+    a2, b2, c2 = splat(c[6, lane]), splat(c[7, lane]), splat(c[8, lane])
+    bound, below = splat(c[9, lane]), splat(-c[9, lane])
+    is_own = tree.ids[cluster * 16 + lane] == leaves.own[row]
+    if is_own:
+        return
+    for word in range(4):
+        wanted = scratch.wanted[word] & scratch.open[slot, word]
+        if wanted == ZERO:
+            continue
+        sure = ZERO
+        possible = ZERO
+        for piece in range(0, 64, 16):
+            if wanted & (_LANE << np.uint64(piece)) == ZERO:
+                continue
+            counters[LANES_TESTED] += 16
+            s = load(parameters, at_s + word * 64 + piece)
+            t = load(parameters, at_s + 256 + word * 64 + piece)
+            f = lesser(
+                lesser(muladd(b0, s, muladd(c0, t, a0)), muladd(b1, s, muladd(c1, t, a1))),
+                muladd(b2, s, muladd(c2, t, a2)),
+            )
+            sure |= np.uint64(bits_above(f, bound)) << np.uint64(piece)
+            possible |= np.uint64(bits_not_below(f, below)) << np.uint64(piece)
+        sure &= wanted
+        left_open = possible & ~sure & wanted
+        if left_open != ZERO:
+            sure |= decide_lane(
+                tree, leaves, light, block, cluster, lane, row, word, left_open, scratch, counters
+            )
+        scratch.open[slot, word] &= ~sure
