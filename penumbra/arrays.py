@@ -198,6 +198,7 @@ class BlockerTree(NamedTuple):
 
     lanes: Float32Array  # (C, 17, 16) see kernels/light_space.py
     fast: Int32Array  # (C,) bit per lane: may be decided in light space
+    straddling: Int32Array  # (C,) bit per lane: of those, may reach the plane of the light or beyond
     careful: Int32Array  # (C,) bit per lane: must be decided in world space
     nodes: Float32Array  # (M, 6, 16) boxes of 16 children; levels one after the other, clusters first
     first_node: Int64Array  # (4,) first node of levels 0, 1, 2 (children of 16, 256, 4096 blockers); M
@@ -210,7 +211,7 @@ class JointScratch(NamedTuple):
 
     open: UInt64Array  # (17, 4) samples of the block not blocked yet, of 16 receivers and of any of them
     wanted: UInt64Array  # (4,) samples in question
+    unsure: UInt64Array  # (4,) samples that float32 leaves open
     bins: Int32Array  # (4, 4, 16) by level, the last of a leaf: first and last bin of s, and of t
-    coefficients: Float32Array  # (10, 16)
-    corners: Float64Array  # (3, 3) the blocker in hand, where it is decided in world space
+    coefficients: Float32Array  # (14, 16) A, B, C of three edges, bound; C, A, B of the plane, bound
     normal: Float64Array  # (6,)

@@ -81,6 +81,7 @@ class JointReceivers:
         tree = BlockerTree(
             lanes=np.empty((n_clusters, N_LANES, 16), np.float32),
             fast=np.empty(n_clusters, np.int32),
+            straddling=np.empty(n_clusters, np.int32),
             careful=np.empty(n_clusters, np.int32),
             nodes=nodes,
             first_node=first,
@@ -96,8 +97,8 @@ def _scratch() -> JointScratch:
         open=np.zeros((17, 4), np.uint64),
         wanted=np.zeros(4, np.uint64),
         bins=np.zeros((4, 4, 16), np.int32),
-        coefficients=np.zeros((10, 16), np.float32),
-        corners=np.zeros((3, 3)),
+        unsure=np.zeros(4, np.uint64),
+        coefficients=np.zeros((14, 16), np.float32),
         normal=np.zeros(6),
     )
 

@@ -43,7 +43,10 @@ _ROUNDOFF = 2.0**-24
 _NEVER = np.float32(-1e30)
 _TINY = np.float32(1e-30)
 _LANE = np.uint64(0xFFFF)
-_ALL = np.int64(0xFFFF)
+# With more samples than this, lanes are first dropped by the rectangle around them.
+_FEW = 6
+# With more than this, one blocker against 16 samples at a time may be cheaper.
+_SOME = 10
 
 
 @helper
@@ -72,9 +75,11 @@ def decide_lane(tree, leaves, light, block, cluster, lane, row, word, candidates
     return blocked
 
 
-@inlined
+@helper
 def decide_lanes(tree, leaves, light, block, cluster, lanes, row, slot, scratch, counters):
-    """Decide whole blockers in world space, for all candidates that are open."""
+    """Decide whole blockers in world space, for all samples wanted that are open."""
+    tree, leaves, light = borrow(tree), borrow(leaves), borrow(light)
+    scratch, counters = borrow(scratch), borrow(counters)
     while lanes != 0:
         lane = lowest_bit(np.uint64(lanes))
         lanes &= lanes - 1
@@ -87,26 +92,41 @@ def decide_lanes(tree, leaves, light, block, cluster, lanes, row, slot, scratch,
                 )
 
 
+@helper
+def decide_samples(tree, leaves, light, block, cluster, lanes, row, slot, scratch, counters):
+    """Decide the samples in scratch.unsure, which some of these lanes left open."""
+    tree, leaves, light = borrow(tree), borrow(leaves), borrow(light)
+    scratch, counters = borrow(scratch), borrow(counters)
+    c = scratch.coefficients
+    sample_set = np.int64(leaves.sample_set[row])
+    for word in range(4):
+        unsure = scratch.unsure[word] & scratch.open[slot, word]
+        while unsure != ZERO:
+            bit = lowest_bit(unsure)
+            unsure &= unsure - ONE
+            s = light.parameters[sample_set, block, 0, word * 64 + bit]
+            t = light.parameters[sample_set, block, 1, word * 64 + bit]
+            for lane in range(16):
+                bound = np.float32(2.0) * c[9, lane]
+                if (
+                    (lanes >> lane) & 1 == 1
+                    and c[0, lane] + c[1, lane] * s + c[2, lane] * t >= -bound
+                    and c[3, lane] + c[4, lane] * s + c[5, lane] * t >= -bound
+                    and c[6, lane] + c[7, lane] * s + c[8, lane] * t >= -bound
+                ):
+                    only = ONE << np.uint64(bit)
+                    scratch.open[slot, word] &= ~decide_lane(
+                        tree, leaves, light, block, cluster, lane, row, word, only, scratch, counters
+                    )
+
+
 @inlined
-def _sure_bit(tree, leaves, light, block, cluster, row, word, bit, sure, possible, scratch, counters):
-    """Whether one sample is blocked by a lane that is sure of it, or by one that is not."""
-    own = leaves.own[row]
-    left_open = possible & ~sure
+def _is_blocked(tree, first, sure, own):
+    """Whether a lane that is sure to block belongs to another triangle than the receiver's own."""
     while sure != 0:
-        lane = lowest_bit(np.uint64(sure))
-        if tree.ids[cluster * 16 + lane] != own:
+        if tree.ids[first + lowest_bit(np.uint64(sure))] != own:
             return True
         sure &= sure - 1
-    while left_open != 0:
-        lane = lowest_bit(np.uint64(left_open))
-        left_open &= left_open - 1
-        if (
-            decide_lane(
-                tree, leaves, light, block, cluster, lane, row, word, ONE << np.uint64(bit), scratch, counters
-            )
-            != ZERO
-        ):
-            return True
     return False
 
 
@@ -130,9 +150,9 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
     doubt = splat(np.float32(light.doubt))
     size = (magnitude(wx) + magnitude(wy)) + (magnitude(wz) + doubt)
     length = load(lanes, first + 240)
-    unsure = size * load(lanes, first + 256) * splat(np.float32(8.0 * _ROUNDOFF)) + splat(_TINY)
+    tilt = load(lanes, first + 256) * splat(np.float32(8.0 * _ROUNDOFF))
     fast = np.int64(tree.fast[cluster])
-    sided = bits_above(magnitude(height), unsure) & fast
+    sided = bits_above(magnitude(height), size * tilt + splat(_TINY)) & fast
     # Turn each blocker so that it is seen from its back, without a branch.
     turn = with_sign(splat(np.float32(1.0)), height)
     wx, wy, wz = wx * turn, wy * turn, wz * turn
@@ -158,8 +178,10 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
         + popcount64(scratch.wanted[3])
     )
     s0, t0, s1, t1 = splat(rect[0]), splat(rect[1]), splat(rect[2]), splat(rect[3])
-    alive = _ALL
-    if n_wanted > 6 or sided != fast:
+    straddling = np.int64(tree.straddling[cluster])
+    alive = sided
+    askew = np.int64(0)
+    if n_wanted > _FEW or sided != fast or straddling != 0:
         # The most and the least that each function reaches among the samples wanted.
         most = lesser(
             lesser(
@@ -168,7 +190,8 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
             ),
             a2 + greater(b2 * s0, b2 * s1) + greater(c2 * t0, c2 * t1),
         )
-        alive = bits_not_below(most, below - bound)
+        within = bits_not_below(most, below - bound)
+        alive &= within
         if sided != fast:
             least = greater(
                 greater(
@@ -177,20 +200,48 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
                 ),
                 a2 + lesser(b2 * s0, b2 * s1) + lesser(c2 * t0, c2 * t1),
             )
-            askew = (alive | bits_not_below(bound + bound, least)) & fast & ~sided
-            if askew != 0:
-                decide_lanes(tree, leaves, light, block, cluster, askew, row, slot, scratch, counters)
-        alive &= sided
-        if alive == 0:
-            return
-    a0 = pick(sided, a0, splat(_NEVER))
-    sample_set = np.int64(leaves.sample_set[row])
-    parameters = light.parameters
-    at_s = (sample_set * light.tables.shape[1] + block) * 512
-    n_alive = popcount64(np.uint64(alive))
-    if n_wanted > 10 and n_alive * 24 < n_wanted * 2:
+            askew = (within | bits_not_below(bound + bound, least)) & fast & ~sided
+    straddling &= alive
+    plain = alive & ~straddling
+    coefficients = scratch.coefficients
+    n_plain = popcount64(np.uint64(plain))
+    by_lane = np.int64(0)
+    if n_wanted > _SOME and n_plain * 24 < n_wanted * 2:
+        by_lane = plain
+        plain = np.int64(0)
         counters[TRIANGLE_MAJOR] += 1
-        coefficients = scratch.coefficients
+    unsure_words = ZERO
+    if plain != 0:
+        chosen = pick(plain, a0, splat(_NEVER))
+        own = leaves.own[row]
+        sample_set = np.int64(leaves.sample_set[row])
+        parameters = light.parameters
+        counters[LANES_TESTED] += n_wanted * 16
+        for word in range(4):
+            wanted = scratch.wanted[word]
+            blocked = ZERO
+            unsure = ZERO
+            while wanted != ZERO:
+                bit = lowest_bit(wanted)
+                only = wanted & (~wanted + ONE)
+                wanted ^= only
+                s = splat(parameters[sample_set, block, 0, word * 64 + bit])
+                t = splat(parameters[sample_set, block, 1, word * 64 + bit])
+                f = lesser(
+                    lesser(muladd(b0, s, muladd(c0, t, chosen)), muladd(b1, s, muladd(c1, t, a1))),
+                    muladd(b2, s, muladd(c2, t, a2)),
+                )
+                possible = bits_not_below(f, below)
+                if possible != 0:
+                    sure = bits_above(f, bound)
+                    if _is_blocked(tree, cluster * 16, sure, own):
+                        blocked |= only
+                    elif sure != possible:
+                        unsure |= only
+            scratch.unsure[word] = unsure
+            unsure_words |= unsure
+            scratch.open[slot, word] &= ~blocked
+    if unsure_words != ZERO or by_lane | straddling != 0:
         store(coefficients, 0, a0)
         store(coefficients, 16, b0)
         store(coefficients, 32, c0)
@@ -201,71 +252,69 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
         store(coefficients, 112, b2)
         store(coefficients, 128, c2)
         store(coefficients, 144, bound)
-        while alive != 0:
-            lane = lowest_bit(np.uint64(alive))
-            alive &= alive - 1
-            _cast_lane(tree, leaves, light, block, cluster, lane, row, slot, at_s, scratch, counters)
-        return
-    counters[LANES_TESTED] += n_wanted * 16
-    for word in range(4):
-        wanted = scratch.wanted[word]
-        if wanted == ZERO:
-            continue
-        blocked = ZERO
-        while wanted != ZERO:
-            bit = lowest_bit(wanted)
-            wanted &= wanted - ONE
-            s = splat(parameters[sample_set, block, 0, word * 64 + bit])
-            t = splat(parameters[sample_set, block, 1, word * 64 + bit])
-            f = lesser(
-                lesser(muladd(b0, s, muladd(c0, t, a0)), muladd(b1, s, muladd(c1, t, a1))),
-                muladd(b2, s, muladd(c2, t, a2)),
-            )
-            possible = bits_not_below(f, below)
-            if possible != 0:
-                sure = bits_above(f, bound)
-                if _sure_bit(
-                    tree, leaves, light, block, cluster, row, word, bit, sure, possible, scratch, counters
-                ):
-                    blocked |= ONE << np.uint64(bit)
-        if blocked != ZERO:
-            scratch.open[slot, word] &= ~blocked
+        if straddling != 0:
+            # Also the plane of the blocker: the light must lie beyond it.
+            store(coefficients, 160, muladd(nx, gx, muladd(ny, gy, nz * gz)) - magnitude(height))
+            store(coefficients, 176, nx)
+            store(coefficients, 192, ny)
+            store(coefficients, 208, tilt * splat(np.float32(2.0)) * (size + splat(reach)) + splat(_TINY))
+        if unsure_words != ZERO:
+            decide_samples(tree, leaves, light, block, cluster, plain, row, slot, scratch, counters)
+        by_lane |= straddling
+        while by_lane != 0:
+            lane = lowest_bit(np.uint64(by_lane))
+            by_lane &= by_lane - 1
+            crosses = (straddling >> lane) & 1 == 1
+            _cast_lane(tree, leaves, light, block, cluster, lane, crosses, row, slot, scratch, counters)
+    if askew != 0:
+        decide_lanes(tree, leaves, light, block, cluster, askew, row, slot, scratch, counters)
 
 
 @inlined
-def _cast_lane(tree, leaves, light, block, cluster, lane, row, slot, at_s, scratch, counters):
+def _cast_lane(tree, leaves, light, block, cluster, lane, crosses, row, slot, scratch, counters):
     """Test one blocker against the samples wanted, 16 at a time."""
+    if tree.ids[cluster * 16 + lane] == leaves.own[row]:
+        return
     c = scratch.coefficients
+    sample_set = np.int64(leaves.sample_set[row])
     parameters = light.parameters
+    at_s = (sample_set * light.tables.shape[1] + block) * 512
     a0, b0, c0 = splat(c[0, lane]), splat(c[1, lane]), splat(c[2, lane])
     a1, b1, c1 = splat(c[3, lane]), splat(c[4, lane]), splat(c[5, lane])
     a2, b2, c2 = splat(c[6, lane]), splat(c[7, lane]), splat(c[8, lane])
     bound, below = splat(c[9, lane]), splat(-c[9, lane])
-    is_own = tree.ids[cluster * 16 + lane] == leaves.own[row]
-    if is_own:
-        return
+    any_left = ZERO
     for word in range(4):
         wanted = scratch.wanted[word] & scratch.open[slot, word]
-        if wanted == ZERO:
-            continue
         sure = ZERO
         possible = ZERO
-        for piece in range(0, 64, 16):
-            if wanted & (_LANE << np.uint64(piece)) == ZERO:
-                continue
-            counters[LANES_TESTED] += 16
-            s = load(parameters, at_s + word * 64 + piece)
-            t = load(parameters, at_s + 256 + word * 64 + piece)
-            f = lesser(
-                lesser(muladd(b0, s, muladd(c0, t, a0)), muladd(b1, s, muladd(c1, t, a1))),
-                muladd(b2, s, muladd(c2, t, a2)),
-            )
-            sure |= np.uint64(bits_above(f, bound)) << np.uint64(piece)
-            possible |= np.uint64(bits_not_below(f, below)) << np.uint64(piece)
-        sure &= wanted
-        left_open = possible & ~sure & wanted
-        if left_open != ZERO:
-            sure |= decide_lane(
-                tree, leaves, light, block, cluster, lane, row, word, left_open, scratch, counters
-            )
-        scratch.open[slot, word] &= ~sure
+        piece = np.int64(0)
+        while wanted >> np.uint64(piece) != ZERO:
+            if (wanted >> np.uint64(piece)) & _LANE != ZERO:
+                counters[LANES_TESTED] += 16
+                s = load(parameters, at_s + word * 64 + piece)
+                t = load(parameters, at_s + 256 + word * 64 + piece)
+                f = lesser(
+                    lesser(muladd(b0, s, muladd(c0, t, a0)), muladd(b1, s, muladd(c1, t, a1))),
+                    muladd(b2, s, muladd(c2, t, a2)),
+                )
+                here, maybe = bits_above(f, bound), bits_not_below(f, below)
+                if crosses:
+                    f = muladd(splat(c[11, lane]), s, muladd(splat(c[12, lane]), t, splat(c[10, lane])))
+                    here &= bits_above(f, splat(c[13, lane]))
+                    maybe &= bits_not_below(f, splat(-c[13, lane]))
+                sure |= np.uint64(here) << np.uint64(piece)
+                possible |= np.uint64(maybe) << np.uint64(piece)
+            piece += 16
+            if piece == 64:
+                break
+        scratch.unsure[word] = possible & ~sure & wanted
+        any_left |= scratch.unsure[word]
+        scratch.open[slot, word] &= ~(sure & wanted)
+    if any_left != ZERO:
+        for word in range(4):
+            if scratch.unsure[word] != ZERO:
+                scratch.open[slot, word] &= ~decide_lane(
+                    tree, leaves, light, block, cluster, lane, row, word, scratch.unsure[word],
+                    scratch, counters,
+                )  # fmt: skip

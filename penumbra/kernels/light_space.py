@@ -101,6 +101,7 @@ def _fill_cluster(tree, light, deepest, cluster, box):
     low = (np.inf, np.inf, np.inf)
     high = (-np.inf, -np.inf, -np.inf)
     fast = np.int64(0)
+    straddling = np.int64(0)
     careful = np.int64(0)
     for lane in range(16):
         t = cluster * 16 + lane
@@ -113,14 +114,17 @@ def _fill_cluster(tree, light, deepest, cluster, box):
             # Behind the light, or farther from it than every receiver.
             _clear_lane(tree.lanes, cluster, lane)
             continue
-        if fits and box[2] > reach:
+        if fits:
             fast |= np.int64(1) << lane
+            if not box[2] > reach:
+                straddling |= np.int64(1) << lane
         else:
             careful |= np.int64(1) << lane
             _clear_lane(tree.lanes, cluster, lane)
         low = (min(low[0], box[0]), min(low[1], box[1]), min(low[2], box[2]))
         high = (max(high[0], box[3]), max(high[1], box[4]), max(high[2], box[5]))
     tree.fast[cluster] = fast
+    tree.straddling[cluster] = straddling
     tree.careful[cluster] = careful
     return low, high
 
