@@ -197,6 +197,7 @@ class BlockerTree(NamedTuple):
     """A chunk in light space, 16 blockers ("cluster") to a vector, under a hierarchy of 16 children a node."""
 
     lanes: Float32Array  # (C, 17, 16) see kernels/light_space.py
+    lane_ids: Int32Array  # (C, 16) low half of the triangle index
     fast: Int32Array  # (C,) bit per lane: may be decided in light space
     straddling: Int32Array  # (C,) bit per lane: of those, may reach the plane of the light or beyond
     careful: Int32Array  # (C,) bit per lane: must be decided in world space

@@ -74,12 +74,15 @@ class JointReceivers:
 
     def _tree(self, chunk: BlockerChunk, threads: int) -> BlockerTree:
         n_blockers = len(chunk.ids)
+        lane_ids = np.full((-(-n_blockers // 16), 16), -1, np.int32)
+        lane_ids.reshape(-1)[:n_blockers] = chunk.ids.astype(np.int32)
         n_clusters, n_low, n_middle, n_top = (-(-n_blockers // 16**k) for k in range(1, 5))
         first = np.array([0, n_low, n_low + n_middle, n_low + n_middle + n_top])
         nodes = np.empty((first[3], 6, 16), np.float32)
         nodes[first[2] :, :3], nodes[first[2] :, 3:] = FAR, -FAR
         tree = BlockerTree(
             lanes=np.empty((n_clusters, N_LANES, 16), np.float32),
+            lane_ids=lane_ids,
             fast=np.empty(n_clusters, np.int32),
             straddling=np.empty(n_clusters, np.int32),
             careful=np.empty(n_clusters, np.int32),

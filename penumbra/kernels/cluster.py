@@ -25,6 +25,7 @@ from penumbra.kernels.counters import (
 from penumbra.kernels.hard_shadow import fill_normal, receiver_side
 from penumbra.kernels.lanes import (
     bits_above,
+    bits_equal,
     bits_not_below,
     greater,
     lesser,
@@ -42,6 +43,7 @@ from penumbra.kernels.segment import segment_is_blocked
 _ROUNDOFF = 2.0**-24
 _NEVER = np.float32(-1e30)
 _TINY = np.float32(1e-30)
+_LOW_HALF = np.int64(0xFFFFFFFF)
 _LANE = np.uint64(0xFFFF)
 # With more samples than this, lanes are first dropped by the rectangle around them.
 _FEW = 6
@@ -121,13 +123,15 @@ def decide_samples(tree, leaves, light, block, cluster, lanes, row, slot, scratc
 
 
 @inlined
-def _is_blocked(tree, first, sure, own):
-    """Whether a lane that is sure to block belongs to another triangle than the receiver's own."""
-    while sure != 0:
-        if tree.ids[first + lowest_bit(np.uint64(sure))] != own:
-            return True
-        sure &= sure - 1
-    return False
+def _own_lane(tree, cluster, own):
+    """Bit of the receiver's own triangle, if it is in the cluster."""
+    same = bits_equal(load(tree.lane_ids, cluster * 16), splat(np.int32(own & _LOW_HALF)))
+    if same != 0:
+        for lane in range(16):
+            t = cluster * 16 + lane
+            if (same >> lane) & 1 == 1 and (t >= tree.ids.shape[0] or tree.ids[t] != own):
+                same &= ~(np.int64(1) << lane)
+    return same
 
 
 @inlined
@@ -201,6 +205,8 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
                 a2 + lesser(b2 * s0, b2 * s1) + lesser(c2 * t0, c2 * t1),
             )
             askew = (within | bits_not_below(bound + bound, least)) & fast & ~sided
+    own = leaves.own[row]
+    alive &= ~_own_lane(tree, cluster, own)
     straddling &= alive
     plain = alive & ~straddling
     coefficients = scratch.coefficients
@@ -213,7 +219,6 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
     unsure_words = ZERO
     if plain != 0:
         chosen = pick(plain, a0, splat(_NEVER))
-        own = leaves.own[row]
         sample_set = np.int64(leaves.sample_set[row])
         parameters = light.parameters
         counters[LANES_TESTED] += n_wanted * 16
@@ -232,12 +237,11 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
                     muladd(b2, s, muladd(c2, t, a2)),
                 )
                 possible = bits_not_below(f, below)
-                if possible != 0:
-                    sure = bits_above(f, bound)
-                    if _is_blocked(tree, cluster * 16, sure, own):
-                        blocked |= only
-                    elif sure != possible:
-                        unsure |= only
+                # Without a branch: whether a sample is blocked is a coin toss.
+                sure = bits_above(f, bound)
+                blocked |= only if sure != 0 else ZERO
+                unsure |= only if possible != 0 else ZERO
+            unsure &= ~blocked
             scratch.unsure[word] = unsure
             unsure_words |= unsure
             scratch.open[slot, word] &= ~blocked
@@ -273,8 +277,6 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
 @inlined
 def _cast_lane(tree, leaves, light, block, cluster, lane, crosses, row, slot, scratch, counters):
     """Test one blocker against the samples wanted, 16 at a time."""
-    if tree.ids[cluster * 16 + lane] == leaves.own[row]:
-        return
     c = scratch.coefficients
     sample_set = np.int64(leaves.sample_set[row])
     parameters = light.parameters

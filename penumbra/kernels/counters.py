@@ -20,6 +20,7 @@ NAMES = (
     "leaves_visited",  # leaf of receivers x chunk x block of samples that the joint descent entered
     "tree_nodes_visited",  # leaf of receivers x node of a chunk's hierarchy
     "clusters_visited",  # leaf of receivers x cluster of 16 blockers
+    "cluster_tests",  # receiver x cluster pairs whose samples were looked up
     "cluster_pairs",  # receiver x cluster pairs set up
     "triangle_major",  # of those, tested one blocker against 16 samples at a time
     "pairs_escalated",  # receiver x blocker pairs decided in world space
@@ -45,6 +46,7 @@ NAMES = (
     LEAVES_VISITED,
     TREE_NODES_VISITED,
     CLUSTERS_VISITED,
+    CLUSTER_TESTS,
     CLUSTER_PAIRS,
     TRIANGLE_MAJOR,
     PAIRS_ESCALATED,

@@ -7,10 +7,10 @@ sample there is blocked already, for the whole leaf first, then for each receive
 import numpy as np
 
 from penumbra.kernels._jit import inlined, kernel
-from penumbra.kernels.bits import ZERO, lowest_bit
+from penumbra.kernels.bits import ZERO, lowest_bit, popcount64
 from penumbra.kernels.borrow import borrow
 from penumbra.kernels.cluster import cast_pair, decide_lanes
-from penumbra.kernels.counters import CLUSTERS_VISITED, LEAVES_VISITED, TREE_NODES_VISITED
+from penumbra.kernels.counters import CLUSTER_TESTS, CLUSTERS_VISITED, LEAVES_VISITED, TREE_NODES_VISITED
 from penumbra.kernels.lanes import (
     any_bit,
     bits_above,
@@ -92,6 +92,7 @@ def _cast_cluster(tree, leaves, light, block, cluster, leaf, extent, scratch, co
         rx, ry, rz, rx, ry, rz, extent, np.float32(light.border), scratch.bins, 192,
     )  # fmt: skip
     alive &= (np.int64(1) << np.int64(leaves.count[leaf])) - 1
+    counters[CLUSTER_TESTS] += popcount64(np.uint64(alive))
     changed = False
     n_blocks = light.full.shape[0]
     while alive != 0:

@@ -123,7 +123,10 @@ def _comparison(sign: str) -> Any:
     @intrinsic
     def apply(typingctx: Any, left: Any, right: Any) -> tuple[Any, Codegen]:
         def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            lanes = builder.fcmp_ordered(sign, args[0], args[1])
+            if isinstance(left.element, types.Float):
+                lanes = builder.fcmp_ordered(sign, args[0], args[1])
+            else:
+                lanes = builder.icmp_signed(sign, args[0], args[1])
             packed = builder.bitcast(lanes, ir.IntType(left.count))
             return builder.zext(packed, ir.IntType(64))
 
@@ -134,6 +137,7 @@ def _comparison(sign: str) -> Any:
 
 _bits_above = _comparison(">")
 _bits_not_below = _comparison(">=")
+_bits_equal = _comparison("==")
 
 
 def _library(name: str, n_arguments: int) -> Any:
@@ -235,7 +239,7 @@ if numba.config.DISABLE_JIT:
 
     def splat(value):
         """Lanes that all hold one float32 or float64."""
-        return np.full(16 if isinstance(value, np.float32) else 8, value)
+        return np.full(8 if isinstance(value, float) else 16, value)
 
     def lesser(left, right):
         """Lesser of two vectors, by lane."""
@@ -252,6 +256,10 @@ if numba.config.DISABLE_JIT:
     def bits_not_below(left, right):
         """Bit k is set where lane k of left >= right; int64."""
         return _packed(left >= right)
+
+    def bits_equal(left, right):
+        """Bit k is set where lane k of left == right; int64."""
+        return _packed(left == right)
 
     def muladd(x, y, z):
         """x * y + z by lane, fused or not."""
@@ -279,6 +287,6 @@ if numba.config.DISABLE_JIT:
 
 else:
     load, store, splat, lesser, greater = _load, _store, _splat, _lesser, _greater
-    bits_above, bits_not_below, pick = _bits_above, _bits_not_below, _pick
+    bits_above, bits_not_below, bits_equal, pick = _bits_above, _bits_not_below, _bits_equal, _pick
     muladd, magnitude, with_sign = _muladd, _magnitude, _with_sign
     to_integers, any_bit = _to_integers, _any_bit
