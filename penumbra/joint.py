@@ -20,9 +20,7 @@ from penumbra.executors.threads import run_tasks
 from penumbra.kernels.counters import N_COUNTERS
 from penumbra.kernels.joint_casting import cast_leaves
 from penumbra.kernels.light_space import FAR, N_LANES, fill_tree_part
-from penumbra.kernels.order import fill_curve_keys
-
-LEAF = 16
+from penumbra.kernels.receiver_leaves import LEAF, fill_leaves, fill_z_keys, sort_keys
 
 
 class JointReceivers:
@@ -35,32 +33,28 @@ class JointReceivers:
         sample_sets: UInt8Array,
         light: LightSpace,
         masks: UInt64Array,
+        threads: int,
     ) -> None:
         """rows: which receivers; masks (R, n_words) are cast on in place."""
         self.light = light
-        points = receivers.points[rows]
-        keys = np.empty(len(rows), np.uint64)
-        fill_curve_keys(points, np.stack([points.min(axis=0), points.max(axis=0)]), keys)
-        order = np.argsort(keys)
         n_leaves = -(-len(rows) // LEAF)
-        slots = order[np.minimum(np.arange(n_leaves * LEAF), len(rows) - 1)]
-        placed = ((points[slots] - light.origin) @ light.matrix.T).reshape(n_leaves, LEAF, 3).transpose(0, 2, 1)
-        high = np.ascontiguousarray(placed, dtype=np.float32)
-        count = np.full(n_leaves, LEAF, np.int32)
-        count[-1] = len(rows) - LEAF * (n_leaves - 1)
+        order = _z_order(receivers.points, rows, threads)
         self.leaves = ReceiverLeaves(
-            high=high,
-            low=np.ascontiguousarray(placed - high, dtype=np.float32),
-            boxes=np.concatenate([high.min(axis=2), high.max(axis=2)], axis=1),
-            count=count,
+            high=np.empty((n_leaves, 3, LEAF), np.float32),
+            low=np.empty((n_leaves, 3, LEAF), np.float32),
+            boxes=np.empty((n_leaves, 6), np.float32),
+            count=np.empty(n_leaves, np.int32),
             is_done=np.zeros(n_leaves, np.uint8),
-            row=rows[slots],
+            row=np.empty(n_leaves * LEAF, np.int64),
             points=receivers.points,
             own=receivers.own,
             sample_set=sample_sets,
             masks=masks,
         )
-        self._deepest = float(high[:, 2].max())
+        run_tasks(
+            lambda part: fill_leaves(self.leaves, rows, order, light, *part), _parts(n_leaves, 4096), threads
+        )
+        self._deepest = float(self.leaves.boxes[:, 5].max())
 
     def cast(self, chunk: BlockerChunk, threads: int, counters: np.ndarray) -> None:
         """Cast a chunk on all leaves; counters (threads, N_COUNTERS)."""
@@ -93,6 +87,26 @@ class JointReceivers:
         )
         run_tasks(lambda part: fill_tree_part(tree, self.light, self._deepest, part), range(n_middle), threads)
         return tree
+
+
+def _z_order(points: Float64Array, rows: Int64Array, threads: int) -> Int64Array:
+    """Order that sorts points[rows] along a Z curve."""
+    n_rows = len(rows)
+    keys, spare_keys = np.empty((2, n_rows), np.uint64)
+    order, spare_order = np.empty((2, n_rows), np.int64)
+    low, high = points.min(axis=0), points.max(axis=0)
+    with np.errstate(all="ignore"):
+        per_unit = np.nan_to_num(np.full(3, 2.0**14 / (high - low).max()), posinf=0.0)
+    run_tasks(
+        lambda part: fill_z_keys(points, rows, *part, low, per_unit, keys), _parts(n_rows, 65536), threads
+    )
+    sort_keys(keys, order, spare_keys, spare_order)
+    return order
+
+
+def _parts(n: int, size: int) -> list[tuple[int, int]]:
+    """Ranges of at most `size` that make up range(n)."""
+    return [(first, min(first + size, n)) for first in range(0, n, size)]
 
 
 def _scratch() -> JointScratch:

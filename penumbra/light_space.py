@@ -25,12 +25,13 @@ def light_space(light: RectLight, side: float, points: Float64Array, bounds: Flo
     origin = light.corner + 0.5 * light.edge_u + 0.5 * light.edge_v
     samples = light.sample_points
     with np.errstate(over="ignore", invalid="ignore"):
-        far = np.abs(origin) + np.maximum(np.abs(points).max(axis=0, initial=0), np.abs(bounds).max(axis=0))
-        far = np.maximum(far, np.abs(samples).max(axis=(0, 1)))
+        corners = np.stack([points.min(axis=0), points.max(axis=0)])
+        ends = [np.abs(ends).max(axis=0) for ends in (corners, bounds, samples.reshape(-1, 3))]
+        far = np.abs(origin) + np.max(ends, axis=0)
         # Difference, three products, two sums; doubled and rounded up.
         world_error = 16 * _U64 * float((np.abs(matrix) @ far).max())
         placed = (samples - origin) @ matrix.T
-        reach = float(np.abs((points - origin) @ matrix.T).max(initial=1.0))
+        reach = max(1.0, float((np.abs(matrix) @ np.abs(corners - origin).max(axis=0)).max()))
     lanes = placed[..., :2].astype(np.float32)
     residual = float(max(np.abs(placed[..., :2] - lanes).max() - _U32, np.abs(placed[..., 2]).max())) + world_error
     slack = 4 * _U32 * reach + 2 * world_error + residual
