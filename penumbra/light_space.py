@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from penumbra.arrays import Float64Array, LightSpace, UInt64Array
+from penumbra.arrays import Float64Array, Int64Array, LightSpace, UInt64Array
 from penumbra.kernels.joint_casting import N_BINS
 from penumbra.lights import RectLight
 
@@ -53,6 +53,14 @@ def light_space(light: RectLight, side: float, points: Float64Array, bounds: Flo
         residual=residual,
         border=16 * _U32 * (1 + reach),
     )
+
+
+def heights_above(space: LightSpace, points: Float64Array, rows: Int64Array) -> Float64Array:
+    """Heights of points[rows] above the plane of the light, in light space."""
+    heights = np.zeros(len(rows))
+    for axis in range(3):
+        heights += (points[rows, axis] - space.origin[axis]) * space.matrix[2, axis]
+    return heights
 
 
 def _matrix(light: RectLight, side: float) -> Float64Array | None:

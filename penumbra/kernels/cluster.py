@@ -32,7 +32,7 @@ from penumbra.kernels.lanes import (
     load,
     magnitude,
     muladd,
-    pick,
+    choose,
     splat,
     store,
     with_sign,
@@ -218,7 +218,7 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
         counters[TRIANGLE_MAJOR] += 1
     unsure_words = ZERO
     if plain != 0:
-        chosen = pick(plain, a0, splat(_NEVER))
+        chosen = choose(plain, a0, splat(_NEVER))
         sample_set = np.int64(leaves.sample_set[row])
         parameters = light.parameters
         counters[LANES_TESTED] += n_wanted * 16

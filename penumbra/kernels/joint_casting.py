@@ -18,15 +18,13 @@ from penumbra.kernels.lanes import (
     greater,
     lesser,
     load,
-    pick,
+    choose,
     splat,
     store,
     to_integers,
 )
-from penumbra.kernels.queue import draw
 
 N_BINS = 64
-_LEAVES_AT_ONCE = np.int64(16)
 _FAR = np.float32(1e25)
 _LAST_BIN = np.float32(N_BINS - 1)
 _NEAR = np.float32(1e-20)
@@ -46,7 +44,7 @@ def _cover(x0, y0, z0, x1, y1, z1, rx0, ry0, rz0, rx1, ry1, rz1, extent, border,
     alive = bits_above(above, zero)
     near = bits_above(beside, splat(_NEAR))
     k0 = rz1 / above
-    k1 = pick(near, rz0 / beside, far)
+    k1 = choose(near, rz0 / beside, far)
     to_left, to_right = x0 - rx1, x1 - rx0
     s0 = rx1 + lesser(to_left * k0, to_left * k1)
     s1 = rx0 + greater(to_right * k0, to_right * k1)
@@ -239,22 +237,16 @@ def _cast_leaf(tree, leaves, light, block, leaf, scratch, counters):
 
 
 @kernel
-def cast_leaves(tree, leaves, light, queue, scratch, counters):
-    """Cast a chunk on the leaves that the queue (1,) hands out, until there are none left."""
+def cast_leaves(tree, leaves, light, first, last, scratch, counters):
+    """Cast a chunk on the leaves first to last (not included) that are not done."""
     tree, leaves, light = borrow(tree), borrow(leaves), borrow(light)
     scratch, counters = borrow(scratch), borrow(counters)
-    n_leaves = leaves.count.shape[0]
-    n_blocks = light.full.shape[0]
-    while True:
-        first = draw(queue, _LEAVES_AT_ONCE)
-        if first >= n_leaves:
-            return
-        for leaf in range(first, min(first + _LEAVES_AT_ONCE, n_leaves)):
-            if leaves.is_done[leaf]:
-                continue
-            is_open = False
-            for block in range(n_blocks):
-                if _cast_leaf(tree, leaves, light, block, leaf, scratch, counters):
-                    is_open = True
-            if not is_open:
-                leaves.is_done[leaf] = 1
+    for leaf in range(first, last):
+        if leaves.is_done[leaf]:
+            continue
+        is_open = False
+        for block in range(light.full.shape[0]):
+            if _cast_leaf(tree, leaves, light, block, leaf, scratch, counters):
+                is_open = True
+        if not is_open:
+            leaves.is_done[leaf] = 1

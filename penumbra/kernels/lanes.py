@@ -3,7 +3,7 @@
 Explicit vectors do not depend on what the auto-vectoriser sees in a loop, and LLVM lowers them on any
 processor: a group of 32 samples against a blocker takes 5 ns, eight planes against a box 2 ns. One
 source serves both modes: load and splat make vectors, + - * / & work on them, lesser and greater pick by
-lane, bits_above packs a comparison, pick chooses by such bits, store puts a vector into an array.
+lane, bits_above packs a comparison, choose chooses by such bits, store puts a vector into an array.
 """
 
 import operator
@@ -173,7 +173,7 @@ def _with_sign(typingctx: Any, x: Any, sign: Any) -> tuple[Any, Codegen]:
 
 
 @intrinsic
-def _pick(typingctx: Any, bits: Any, x: Any, y: Any) -> tuple[Any, Codegen]:
+def _choose(typingctx: Any, bits: Any, x: Any, y: Any) -> tuple[Any, Codegen]:
     """Lane of x where its bit is set, otherwise of y."""
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -273,7 +273,7 @@ if numba.config.DISABLE_JIT:
         """x by lane, with the sign of `sign`."""
         return np.copysign(x, sign)
 
-    def pick(bits, x, y):
+    def choose(bits, x, y):
         """Lane of x where its bit is set, otherwise of y."""
         return np.where(np.int64(bits) >> np.arange(len(x)) & 1 == 1, x, y)
 
@@ -287,6 +287,6 @@ if numba.config.DISABLE_JIT:
 
 else:
     load, store, splat, lesser, greater = _load, _store, _splat, _lesser, _greater
-    bits_above, bits_not_below, bits_equal, pick = _bits_above, _bits_not_below, _bits_equal, _pick
+    bits_above, bits_not_below, bits_equal, choose = _bits_above, _bits_not_below, _bits_equal, _choose
     muladd, magnitude, with_sign = _muladd, _magnitude, _with_sign
     to_integers, any_bit = _to_integers, _any_bit

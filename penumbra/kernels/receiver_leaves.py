@@ -79,9 +79,14 @@ def sort_keys(keys, order, spare_keys, spare_order):
 
 
 @kernel
-def fill_leaves(leaves, rows, order, light, first, last):
-    """Fill leaves first to last (not included) with the receivers rows[order[...]], 16 each."""
+def fill_leaves(leaves, rows, order, light, first, last, box):
+    """Fill leaves first to last (not included) with the receivers rows[order[...]], 16 each.
+
+    Sets box (6,) to their bounds in world space.
+    """
     leaves, light = borrow(leaves), borrow(light)
+    box[:3] = np.inf
+    box[3:] = -np.inf
     matrix, origin = light.matrix, light.origin
     n_rows = order.shape[0]
     for leaf in range(first, last):
@@ -96,6 +101,8 @@ def fill_leaves(leaves, rows, order, light, first, last):
             y = leaves.points[row, 1] - origin[1]
             z = leaves.points[row, 2] - origin[2]
             for axis in range(3):
+                box[axis] = min(box[axis], leaves.points[row, axis])
+                box[3 + axis] = max(box[3 + axis], leaves.points[row, axis])
                 place = matrix[axis, 0] * x + matrix[axis, 1] * y + matrix[axis, 2] * z
                 high = np.float32(place)
                 leaves.high[leaf, axis, slot] = high
