@@ -211,7 +211,9 @@ class JointScratch(NamedTuple):
     """Working memory of one thread of the joint descent."""
 
     open: UInt64Array  # (17, 4) samples of the block not blocked yet, of 16 receivers and of any of them
-    wanted: UInt64Array  # (4,) samples in question
+    wanted: UInt64Array  # (17, 4) samples in question, of each receiver that has any
+    slots: Int64Array  # (17,) which receivers of the leaf those are
+    tables: Int64Array  # (16,) where in LightSpace.tables the sample set of each receiver begins
     unsure: UInt64Array  # (4,) samples that float32 leaves open
     bins: Int32Array  # (4, 4, 16) by level, the last of a leaf: first and last bin of s, and of t
     coefficients: Float32Array  # (14, 16) A, B, C of three edges, bound; C, A, B of the plane, bound

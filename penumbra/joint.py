@@ -176,7 +176,9 @@ def _parts(n: int, size: int) -> list[tuple[int, int]]:
 def _scratch() -> JointScratch:
     return JointScratch(
         open=np.zeros((17, 4), np.uint64),
-        wanted=np.zeros(4, np.uint64),
+        wanted=np.zeros((17, 4), np.uint64),
+        slots=np.zeros(17, np.int64),
+        tables=np.zeros(16, np.int64),
         unsure=np.zeros(4, np.uint64),
         bins=np.zeros((4, 4, 16), np.int32),
         coefficients=np.zeros((14, 16), np.float32),

@@ -47,6 +47,9 @@ _LOW_HALF = np.int64(0xFFFFFFFF)
 _LANE = np.uint64(0xFFFF)
 # With more samples than this, lanes are first dropped by the rectangle around them.
 _FEW = 6
+# The rectangle is a little larger than the bins, for the rounding of its sides.
+_MARGIN = np.float32(0.01)
+_NEXT = np.float32(1.01)
 # With more than this, one blocker against 16 samples at a time may be cheaper.
 _SOME = 10
 
@@ -78,16 +81,18 @@ def decide_lane(tree, leaves, light, block, cluster, lane, row, word, candidates
 
 
 @helper
-def decide_lanes(tree, leaves, light, block, cluster, lanes, row, slot, scratch, counters):
+def decide_lanes(tree, leaves, light, block, cluster, lanes, leaf, pair, scratch, counters):
     """Decide whole blockers in world space, for all samples wanted that are open."""
     tree, leaves, light = borrow(tree), borrow(leaves), borrow(light)
     scratch, counters = borrow(scratch), borrow(counters)
+    slot = np.int64(scratch.slots[pair])
+    row = leaves.row[leaf * 16 + slot]
     while lanes != 0:
         lane = lowest_bit(np.uint64(lanes))
         lanes &= lanes - 1
         counters[PAIRS_ESCALATED] += 1
         for word in range(4):
-            candidates = scratch.wanted[word] & scratch.open[slot, word]
+            candidates = scratch.wanted[pair, word] & scratch.open[slot, word]
             if candidates != ZERO:
                 scratch.open[slot, word] &= ~decide_lane(
                     tree, leaves, light, block, cluster, lane, row, word, candidates, scratch, counters
@@ -135,11 +140,9 @@ def _own_lane(tree, cluster, own):
 
 
 @inlined
-def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, counters):
-    """Clear the open samples of a receiver that a cluster blocks, of those in scratch.wanted.
-
-    rect: least s, least t, greatest s, greatest t of the samples wanted.
-    """
+def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, counters):
+    """Clear the open samples of a receiver that a cluster blocks, of those in scratch.wanted[pair]."""
+    slot = np.int64(scratch.slots[pair])
     row = leaves.row[leaf * 16 + slot]
     counters[CLUSTER_PAIRS] += 1
     first = cluster * (N_LANES * 16)
@@ -175,17 +178,18 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
     bound = (size + length) * length * splat(factor) + splat(_TINY)
     below = splat(np.float32(0.0)) - bound
 
-    n_wanted = (
-        popcount64(scratch.wanted[0])
-        + popcount64(scratch.wanted[1])
-        + popcount64(scratch.wanted[2])
-        + popcount64(scratch.wanted[3])
-    )
-    s0, t0, s1, t1 = splat(rect[0]), splat(rect[1]), splat(rect[2]), splat(rect[3])
+    w0, w1 = scratch.wanted[pair, 0], scratch.wanted[pair, 1]
+    w2, w3 = scratch.wanted[pair, 2], scratch.wanted[pair, 3]
+    n_wanted = (popcount64(w0) + popcount64(w1)) + (popcount64(w2) + popcount64(w3))
     straddling = np.int64(tree.straddling[cluster])
     alive = sided
     askew = np.int64(0)
     if n_wanted > _FEW or sided != fast or straddling != 0:
+        bins = scratch.bins
+        s0 = splat(extent[0] + (np.float32(bins[3, 0, slot]) - _MARGIN) / extent[4])
+        s1 = splat(extent[0] + (np.float32(bins[3, 1, slot]) + _NEXT) / extent[4])
+        t0 = splat(extent[1] + (np.float32(bins[3, 2, slot]) - _MARGIN) / extent[5])
+        t1 = splat(extent[1] + (np.float32(bins[3, 3, slot]) + _NEXT) / extent[5])
         # The most and the least that each function reaches among the samples wanted.
         most = lesser(
             lesser(
@@ -223,7 +227,7 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
         parameters = light.parameters
         counters[LANES_TESTED] += n_wanted * 16
         for word in range(4):
-            wanted = scratch.wanted[word]
+            wanted = scratch.wanted[pair, word]
             blocked = ZERO
             unsure = ZERO
             while wanted != ZERO:
@@ -236,8 +240,8 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
                     lesser(muladd(b0, s, muladd(c0, t, chosen)), muladd(b1, s, muladd(c1, t, a1))),
                     muladd(b2, s, muladd(c2, t, a2)),
                 )
-                possible = bits_not_below(f, below)
                 # Without a branch: whether a sample is blocked is a coin toss.
+                possible = bits_not_below(f, below)
                 sure = bits_above(f, bound)
                 blocked |= only if sure != 0 else ZERO
                 unsure |= only if possible != 0 else ZERO
@@ -269,14 +273,15 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, co
             lane = lowest_bit(np.uint64(by_lane))
             by_lane &= by_lane - 1
             crosses = (straddling >> lane) & 1 == 1
-            _cast_lane(tree, leaves, light, block, cluster, lane, crosses, row, slot, scratch, counters)
+            _cast_lane(tree, leaves, light, block, cluster, lane, crosses, row, pair, scratch, counters)
     if askew != 0:
-        decide_lanes(tree, leaves, light, block, cluster, askew, row, slot, scratch, counters)
+        decide_lanes(tree, leaves, light, block, cluster, askew, leaf, pair, scratch, counters)
 
 
 @inlined
-def _cast_lane(tree, leaves, light, block, cluster, lane, crosses, row, slot, scratch, counters):
+def _cast_lane(tree, leaves, light, block, cluster, lane, crosses, row, pair, scratch, counters):
     """Test one blocker against the samples wanted, 16 at a time."""
+    slot = np.int64(scratch.slots[pair])
     c = scratch.coefficients
     sample_set = np.int64(leaves.sample_set[row])
     parameters = light.parameters
@@ -287,7 +292,7 @@ def _cast_lane(tree, leaves, light, block, cluster, lane, crosses, row, slot, sc
     bound, below = splat(c[9, lane]), splat(-c[9, lane])
     any_left = ZERO
     for word in range(4):
-        wanted = scratch.wanted[word] & scratch.open[slot, word]
+        wanted = scratch.wanted[pair, word] & scratch.open[slot, word]
         sure = ZERO
         possible = ZERO
         piece = np.int64(0)

@@ -91,35 +91,26 @@ def _cast_cluster(tree, leaves, light, block, cluster, leaf, extent, scratch, co
     )  # fmt: skip
     alive &= (np.int64(1) << np.int64(leaves.count[leaf])) - 1
     counters[CLUSTER_TESTS] += popcount64(np.uint64(alive))
-    changed = False
-    n_blocks = light.full.shape[0]
+    n_pairs = np.int64(0)
     while alive != 0:
         slot = lowest_bit(np.uint64(alive))
         alive &= alive - 1
-        row = leaves.row[leaf * 16 + slot]
-        table = (np.int64(leaves.sample_set[row]) * n_blocks + block) * (4 * _TABLE)
-        samples = _samples_between(light.tables, table, scratch.bins, 3, slot) & load(
+        samples = _samples_between(light.tables, scratch.tables[slot], scratch.bins, 3, slot) & load(
             scratch.open, slot * 4
         )
-        if not any_bit(samples):
-            continue
-        store(scratch.wanted, 0, samples)
-        changed = True
-        bins = scratch.bins
-        rect = (
-            extent[0] + (np.float32(bins[3, 0, slot]) - np.float32(0.01)) / extent[4],
-            extent[1] + (np.float32(bins[3, 2, slot]) - np.float32(0.01)) / extent[5],
-            extent[0] + (np.float32(bins[3, 1, slot]) + np.float32(1.01)) / extent[4],
-            extent[1] + (np.float32(bins[3, 3, slot]) + np.float32(1.01)) / extent[5],
-        )
+        # Without a branch: whether a receiver has such samples is a coin toss.
+        store(scratch.wanted, n_pairs * 4, samples)
+        scratch.slots[n_pairs] = slot
+        n_pairs += np.int64(any_bit(samples))
+    for pair in range(n_pairs):
         if tree.careful[cluster] != 0:
             decide_lanes(
-                tree, leaves, light, block, cluster, np.int64(tree.careful[cluster]), row, slot,
+                tree, leaves, light, block, cluster, np.int64(tree.careful[cluster]), leaf, pair,
                 scratch, counters,
             )  # fmt: skip
         if tree.fast[cluster] != 0:
-            cast_pair(tree, leaves, light, block, cluster, leaf, slot, rect, scratch, counters)
-    return changed
+            cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, counters)
+    return n_pairs > 0
 
 
 @inlined
@@ -127,6 +118,10 @@ def _open_samples(leaves, light, block, leaf, scratch):
     """Fill scratch.open from the masks; returns whether any sample of the leaf is open."""
     n_words = light.n_words
     any_open = ZERO
+    n_blocks = light.full.shape[0]
+    for slot in range(leaves.count[leaf]):
+        sample_set = np.int64(leaves.sample_set[leaves.row[leaf * 16 + slot]])
+        scratch.tables[slot] = (sample_set * n_blocks + block) * (4 * _TABLE)
     for word in range(4):
         at = block * 4 + word
         union = ZERO
