@@ -181,9 +181,11 @@ class LightSpace(NamedTuple):
 class ReceiverLeaves(NamedTuple):
     """Receivers in leaves of 16, in the order of a curve: one lane each. N leaves, n receivers."""
 
-    high: Float32Array  # (N, 3, 16) light space; high + low is the place to 2**-48
-    low: Float32Array  # (N, 3, 16)
-    boxes: Float32Array  # (N, 6) min and max of `high`
+    places: Float32Array  # (N, 3, 16) light space
+    offsets: Float32Array  # (N, 3, 16) from the centre, which is not rounded to a float32 first
+    centres: Float32Array  # (N, 6) centre as a float32, and what that leaves out
+    reaches: Float32Array  # (N, 2) largest offset, largest distance from a sample (sums of absolute values)
+    boxes: Float32Array  # (N, 6) min and max of `places`
     count: Int32Array  # (N,) receivers; lanes beyond are copies of the last
     is_done: UInt8Array  # (N,) nothing is left to block
     row: Int64Array  # (16 N,) row of the receiver in points, masks, ...
@@ -216,5 +218,6 @@ class JointScratch(NamedTuple):
     tables: Int64Array  # (16,) where in LightSpace.tables the sample set of each receiver begins
     unsure: UInt64Array  # (4,) samples that float32 leaves open
     bins: Int32Array  # (4, 4, 16) by level, the last of a leaf: first and last bin of s, and of t
+    cluster: Float32Array  # (5, 16) first corners from the centre of the leaf; bounds of plane, of edges
     coefficients: Float32Array  # (14, 16) A, B, C of three edges, bound; C, A, B of the plane, bound
     normal: Float64Array  # (6,)

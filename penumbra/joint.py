@@ -79,8 +79,10 @@ class JointReceivers:
         n_leaves = -(-len(rows) // LEAF)
         order = _z_order(receivers.points, rows, threads)
         leaves = self.leaves = ReceiverLeaves(
-            high=np.empty((n_leaves, 3, LEAF), np.float32),
-            low=np.empty((n_leaves, 3, LEAF), np.float32),
+            places=np.empty((n_leaves, 3, LEAF), np.float32),
+            offsets=np.empty((n_leaves, 3, LEAF), np.float32),
+            centres=np.empty((n_leaves, 6), np.float32),
+            reaches=np.empty((n_leaves, 2), np.float32),
             boxes=np.empty((n_leaves, 6), np.float32),
             count=np.empty(n_leaves, np.int32),
             is_done=np.zeros(n_leaves, np.uint8),
@@ -127,8 +129,8 @@ class JointReceivers:
     @property
     def hierarchy_bytes(self) -> int:
         """Bytes of the leaves, without what is the caller's."""
-        leaves = self.leaves
-        return sum(a.nbytes for a in (leaves.high, leaves.low, leaves.boxes, leaves.count, leaves.row))
+        shared = ("points", "own", "sample_set", "masks")
+        return sum(a.nbytes for name, a in self.leaves._asdict().items() if name not in shared)
 
     def _tree(self, chunk: BlockerChunk, threads: int) -> BlockerTree:
         n_blockers = len(chunk.ids)
@@ -181,6 +183,7 @@ def _scratch() -> JointScratch:
         tables=np.zeros(16, np.int64),
         unsure=np.zeros(4, np.uint64),
         bins=np.zeros((4, 4, 16), np.int32),
+        cluster=np.zeros((5, 16), np.float32),
         coefficients=np.zeros((14, 16), np.float32),
         normal=np.zeros(6),
     )

@@ -5,9 +5,10 @@ Sample l is blocked where all three have the sign of (v - r) . (v_1 - v_0) x (v_
 r l meets the blocker, and meets it ahead of r; and before l, since a fast lane lies wholly in front of the light. 
 
 Rounding, in units of u = 2**-24 times (|w| + E) E G, w = v_0 - r, E the length of the edges, G >= |l - r|:
-w 2.1 and its edge 1, products and difference 2 give 5.2 for n_0 and n_2; n_1 = N - n_0 - n_2 adds them,
-N and two roundings: 13.4; the function adds 6 for its own products and sums, s and t: below 20, of the
-32 that are allowed for. The error of places in light space beyond that is `doubt`, added to |w|.
+w (from the centre of the leaf, then from the receiver, |w| the sum of both) 3.1 and its edge 1, products
+and difference 2 give 6.2 for n_0 and n_2; n_1 = N - n_0 - n_2 adds them, N and two roundings: 17.5; the
+function adds 6 for its own products and sums, s and t: below 24, of the 32 that are allowed for. The
+error of places in light space beyond that is `doubt`, added to |w|.
 """
 
 import numpy as np
@@ -27,12 +28,13 @@ from penumbra.kernels.lanes import (
     bits_above,
     bits_equal,
     bits_not_below,
+    choose,
     greater,
     lesser,
     load,
     magnitude,
     muladd,
-    choose,
+    prefetch,
     splat,
     store,
     with_sign,
@@ -140,6 +142,33 @@ def _own_lane(tree, cluster, own):
 
 
 @inlined
+def prefetch_cluster(tree, cluster):
+    """Ask for the lanes of a cluster while its receivers are looked up."""
+    for k in range(N_LANES):
+        prefetch(tree.lanes, (cluster * N_LANES + k) * 16)
+
+
+@inlined
+def prepare_cluster(tree, leaves, light, cluster, leaf, scratch):
+    """Fill scratch.cluster: what is the same for all receivers of a leaf."""
+    first = cluster * (N_LANES * 16)
+    lanes, centre = tree.lanes, leaves.centres[leaf]
+    wx = (load(lanes, first) - splat(centre[0])) + (load(lanes, first + 48) - splat(centre[3]))
+    wy = (load(lanes, first + 16) - splat(centre[1])) + (load(lanes, first + 64) - splat(centre[4]))
+    wz = (load(lanes, first + 32) - splat(centre[2])) + (load(lanes, first + 80) - splat(centre[5]))
+    radius = splat(leaves.reaches[leaf, 0] + np.float32(light.doubt))
+    size = (magnitude(wx) + magnitude(wy)) + (magnitude(wz) + radius)
+    length = load(lanes, first + 240)
+    tilt = load(lanes, first + 256) * splat(np.float32(8.0 * _ROUNDOFF))
+    factor = np.float32(np.float32(32.0 * _ROUNDOFF) * leaves.reaches[leaf, 1] + np.float32(4.0 * light.residual))
+    store(scratch.cluster, 0, wx)
+    store(scratch.cluster, 16, wy)
+    store(scratch.cluster, 32, wz)
+    store(scratch.cluster, 48, size * tilt + splat(_TINY))
+    store(scratch.cluster, 64, (size + length) * length * splat(factor) + splat(_TINY))
+
+
+@inlined
 def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, counters):
     """Clear the open samples of a receiver that a cluster blocks, of those in scratch.wanted[pair]."""
     slot = np.int64(scratch.slots[pair])
@@ -147,19 +176,16 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, 
     counters[CLUSTER_PAIRS] += 1
     first = cluster * (N_LANES * 16)
     lanes = tree.lanes
-    rx, ry, rz = leaves.high[leaf, 0, slot], leaves.high[leaf, 1, slot], leaves.high[leaf, 2, slot]
-    lx, ly, lz = leaves.low[leaf, 0, slot], leaves.low[leaf, 1, slot], leaves.low[leaf, 2, slot]
-    wx = (load(lanes, first) - splat(rx)) + (load(lanes, first + 48) - splat(lx))
-    wy = (load(lanes, first + 16) - splat(ry)) + (load(lanes, first + 64) - splat(ly))
-    wz = (load(lanes, first + 32) - splat(rz)) + (load(lanes, first + 80) - splat(lz))
+    rx, ry, rz = leaves.places[leaf, 0, slot], leaves.places[leaf, 1, slot], leaves.places[leaf, 2, slot]
+    wx = load(scratch.cluster, 0) - splat(leaves.offsets[leaf, 0, slot])
+    wy = load(scratch.cluster, 16) - splat(leaves.offsets[leaf, 1, slot])
+    wz = load(scratch.cluster, 32) - splat(leaves.offsets[leaf, 2, slot])
+    bound = load(scratch.cluster, 64)
+    below = splat(np.float32(0.0)) - bound
     nx, ny, nz = load(lanes, first + 192), load(lanes, first + 208), load(lanes, first + 224)
     height = muladd(wx, nx, muladd(wy, ny, wz * nz))
-    doubt = splat(np.float32(light.doubt))
-    size = (magnitude(wx) + magnitude(wy)) + (magnitude(wz) + doubt)
-    length = load(lanes, first + 240)
-    tilt = load(lanes, first + 256) * splat(np.float32(8.0 * _ROUNDOFF))
     fast = np.int64(tree.fast[cluster])
-    sided = bits_above(magnitude(height), size * tilt + splat(_TINY)) & fast
+    sided = bits_above(magnitude(height), load(scratch.cluster, 48)) & fast
     # Turn each blocker so that it is seen from its back, without a branch.
     turn = with_sign(splat(np.float32(1.0)), height)
     wx, wy, wz = wx * turn, wy * turn, wz * turn
@@ -173,11 +199,6 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, 
     a0 = muladd(b0, gx, muladd(c0, gy, d0 * gz))
     a1 = muladd(b1, gx, muladd(c1, gy, d1 * gz))
     a2 = muladd(b2, gx, muladd(c2, gy, d2 * gz))
-    reach = abs(rx) + abs(ry) + abs(rz) + np.float32(1.0)
-    factor = np.float32(np.float32(32.0 * _ROUNDOFF) * reach + np.float32(4.0 * light.residual))
-    bound = (size + length) * length * splat(factor) + splat(_TINY)
-    below = splat(np.float32(0.0)) - bound
-
     w0, w1 = scratch.wanted[pair, 0], scratch.wanted[pair, 1]
     w2, w3 = scratch.wanted[pair, 2], scratch.wanted[pair, 3]
     n_wanted = (popcount64(w0) + popcount64(w1)) + (popcount64(w2) + popcount64(w3))
@@ -265,7 +286,13 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, 
             store(coefficients, 160, muladd(nx, gx, muladd(ny, gy, nz * gz)) - magnitude(height))
             store(coefficients, 176, nx)
             store(coefficients, 192, ny)
-            store(coefficients, 208, tilt * splat(np.float32(2.0)) * (size + splat(reach)) + splat(_TINY))
+            # The height's own bound is 8 units of |w|: 16 of |w| and |l - r|, and twice that.
+            reach = splat(leaves.reaches[leaf, 1] * np.float32(32.0 * _ROUNDOFF))
+            store(
+                coefficients,
+                208,
+                load(scratch.cluster, 48) * splat(np.float32(4.0)) + load(lanes, first + 256) * reach,
+            )
         if unsure_words != ZERO:
             decide_samples(tree, leaves, light, block, cluster, plain, row, slot, scratch, counters)
         by_lane |= straddling

@@ -9,7 +9,7 @@ import numpy as np
 from penumbra.kernels._jit import inlined, kernel
 from penumbra.kernels.bits import ZERO, lowest_bit, popcount64
 from penumbra.kernels.borrow import borrow
-from penumbra.kernels.cluster import cast_pair, decide_lanes
+from penumbra.kernels.cluster import cast_pair, decide_lanes, prefetch_cluster, prepare_cluster
 from penumbra.kernels.counters import CLUSTER_TESTS, CLUSTERS_VISITED, LEAVES_VISITED, TREE_NODES_VISITED
 from penumbra.kernels.lanes import (
     any_bit,
@@ -80,9 +80,9 @@ def _cast_cluster(tree, leaves, light, block, cluster, leaf, extent, scratch, co
     node, lane = cluster >> 4, cluster & 15
     nodes = tree.nodes
     rx, ry, rz = (
-        load(leaves.high, leaf * 48),
-        load(leaves.high, leaf * 48 + 16),
-        load(leaves.high, leaf * 48 + 32),
+        load(leaves.places, leaf * 48),
+        load(leaves.places, leaf * 48 + 16),
+        load(leaves.places, leaf * 48 + 32),
     )
     alive = _cover(
         splat(nodes[node, 0, lane]), splat(nodes[node, 1, lane]), splat(nodes[node, 2, lane]),
@@ -91,6 +91,7 @@ def _cast_cluster(tree, leaves, light, block, cluster, leaf, extent, scratch, co
     )  # fmt: skip
     alive &= (np.int64(1) << np.int64(leaves.count[leaf])) - 1
     counters[CLUSTER_TESTS] += popcount64(np.uint64(alive))
+    prefetch_cluster(tree, cluster)
     n_pairs = np.int64(0)
     while alive != 0:
         slot = lowest_bit(np.uint64(alive))
@@ -102,6 +103,8 @@ def _cast_cluster(tree, leaves, light, block, cluster, leaf, extent, scratch, co
         store(scratch.wanted, n_pairs * 4, samples)
         scratch.slots[n_pairs] = slot
         n_pairs += np.int64(any_bit(samples))
+    if n_pairs > 0:
+        prepare_cluster(tree, leaves, light, cluster, leaf, scratch)
     for pair in range(n_pairs):
         if tree.careful[cluster] != 0:
             decide_lanes(

@@ -66,6 +66,26 @@ def _load(typingctx: Any, array: Any, offset: Any) -> tuple[Any, Codegen]:
 
 
 @intrinsic
+def _prefetch(typingctx: Any, array: Any, offset: Any) -> tuple[Any, Codegen]:
+    """Ask for the cache line at a flat element offset of an array."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, args[0]).data
+        pointer = builder.bitcast(builder.gep(data, [args[1]]), ir.IntType(8).as_pointer())
+        flag = ir.IntType(32)
+        function = cgutils.get_or_insert_function(
+            builder.module,
+            ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer(), flag, flag, flag]),
+            "llvm.prefetch.p0",
+        )
+        # To be read, into every level of cache, as data.
+        builder.call(function, [pointer, flag(0), flag(3), flag(1)])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), codegen
+
+
+@intrinsic
 def _store(typingctx: Any, array: Any, offset: Any, lanes: Any) -> tuple[Any, Codegen]:
     """Put lanes into a C-contiguous array, from a flat element offset on."""
 
@@ -237,6 +257,9 @@ if numba.config.DISABLE_JIT:
         """Put lanes into a C-contiguous array, from a flat element offset on."""
         array.reshape(-1)[offset : offset + len(lanes)] = lanes
 
+    def prefetch(array, offset):
+        """Ask for the cache line at a flat element offset of an array."""
+
     def splat(value):
         """Lanes that all hold one float32 or float64."""
         return np.full(8 if isinstance(value, float) else 16, value)
@@ -286,7 +309,7 @@ if numba.config.DISABLE_JIT:
         return bool(x.any())
 
 else:
-    load, store, splat, lesser, greater = _load, _store, _splat, _lesser, _greater
+    load, store, prefetch, splat, lesser, greater = _load, _store, _prefetch, _splat, _lesser, _greater
     bits_above, bits_not_below, bits_equal, choose = _bits_above, _bits_not_below, _bits_equal, _choose
     muladd, magnitude, with_sign = _muladd, _magnitude, _with_sign
     to_integers, any_bit = _to_integers, _any_bit

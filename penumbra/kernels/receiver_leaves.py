@@ -10,6 +10,8 @@ _AXIS_BITS = 14
 _DIGIT_BITS = np.uint64(11)
 _N_DIGITS = 4
 _N_BUCKETS = 1 << 11
+# Rounding to float32 may go down.
+_UP = 1.0 + 2.0**-20
 _DIGIT = np.uint64(_N_BUCKETS - 1)
 # Each line moves the upper half of every group of bits away from the lower one, to every third bit.
 _SPREAD = np.array(
@@ -78,6 +80,36 @@ def sort_keys(keys, order, spare_keys, spare_order):
         order, spare_order = spare_order, order
 
 
+@helper
+def _fill_leaf(leaves, leaf, placed):
+    """Set all of a leaf that follows from its places in light space, (3, 16)."""
+    radius = 0.0
+    reach = 1.0
+    for axis in range(3):
+        low = high = placed[axis, 0]
+        farthest = 0.0
+        for slot in range(LEAF):
+            place = placed[axis, slot]
+            leaves.places[leaf, axis, slot] = np.float32(place)
+            low, high = min(low, place), max(high, place)
+            farthest = max(farthest, abs(place))
+        leaves.boxes[leaf, axis] = np.float32(low)
+        leaves.boxes[leaf, 3 + axis] = np.float32(high)
+        centre = 0.5 * low + 0.5 * high
+        nearest = np.float32(centre)
+        leaves.centres[leaf, axis] = nearest
+        leaves.centres[leaf, 3 + axis] = np.float32(centre - np.float64(nearest))
+        largest = 0.0
+        for slot in range(LEAF):
+            offset = placed[axis, slot] - centre
+            leaves.offsets[leaf, axis, slot] = np.float32(offset)
+            largest = max(largest, abs(offset))
+        radius += largest
+        reach += farthest
+    leaves.reaches[leaf, 0] = np.float32(radius * _UP)
+    leaves.reaches[leaf, 1] = np.float32(reach * _UP)
+
+
 @kernel
 def fill_leaves(leaves, rows, order, light, first, last, box):
     """Fill leaves first to last (not included) with the receivers rows[order[...]], 16 each.
@@ -89,11 +121,9 @@ def fill_leaves(leaves, rows, order, light, first, last, box):
     box[3:] = -np.inf
     matrix, origin = light.matrix, light.origin
     n_rows = order.shape[0]
+    placed = np.empty((3, LEAF))
     for leaf in range(first, last):
         leaves.count[leaf] = min(LEAF, n_rows - leaf * LEAF)
-        for axis in range(3):
-            leaves.boxes[leaf, axis] = np.inf
-            leaves.boxes[leaf, 3 + axis] = -np.inf
         for slot in range(LEAF):
             row = rows[order[min(leaf * LEAF + slot, n_rows - 1)]]
             leaves.row[leaf * LEAF + slot] = row
@@ -103,9 +133,5 @@ def fill_leaves(leaves, rows, order, light, first, last, box):
             for axis in range(3):
                 box[axis] = min(box[axis], leaves.points[row, axis])
                 box[3 + axis] = max(box[3 + axis], leaves.points[row, axis])
-                place = matrix[axis, 0] * x + matrix[axis, 1] * y + matrix[axis, 2] * z
-                high = np.float32(place)
-                leaves.high[leaf, axis, slot] = high
-                leaves.low[leaf, axis, slot] = np.float32(place - np.float64(high))
-                leaves.boxes[leaf, axis] = min(leaves.boxes[leaf, axis], high)
-                leaves.boxes[leaf, 3 + axis] = max(leaves.boxes[leaf, 3 + axis], high)
+                placed[axis, slot] = matrix[axis, 0] * x + matrix[axis, 1] * y + matrix[axis, 2] * z
+        _fill_leaf(leaves, leaf, placed)
