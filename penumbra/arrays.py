@@ -159,7 +159,7 @@ class CastSwitches(NamedTuple):
 class LightSpace(NamedTuple):
     """A light for the joint descent: an affine map that takes it to the square |s|, |t| <= 1/2 at z = 0.
 
-    K samples in B blocks of 256 consecutive bits, S sets. A table holds, for each of 64 bins of a block's
+    K samples in B blocks of 256 consecutive bits, S sets. A table holds, for each of 128 bins of a block's
     extent along s or t, the samples in that bin or beyond: [set][block][kind][bin] is four words, kind
     0: s from this bin on, 1: s up to this bin, 2 and 3: the same of t. Set S stands for all sets.
     """
@@ -167,7 +167,7 @@ class LightSpace(NamedTuple):
     matrix: Float64Array  # (3, 3) and
     origin: Float64Array  # (3,): light space = matrix (world - origin); z > 0 on the receivers' side
     parameters: Float32Array  # (S, B, 2, 256) s and t of the samples; copies of the last one fill up
-    tables: UInt64Array  # (S + 1, B, 4, 64, 4)
+    tables: UInt64Array  # (S + 1, B, 4, 128, 4)
     extents: Float32Array  # (B, 6) least s, least t, greatest s, greatest t of all sets; bins per s, per t
     points: Float64Array  # (S, 256 B, 3) the samples themselves, world space
     full: UInt64Array  # (B, 4) bits that stand for samples

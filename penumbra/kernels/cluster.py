@@ -248,6 +248,13 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, 
         parameters = light.parameters
         counters[LANES_TESTED] += n_wanted * 16
         for word in range(4):
+            scratch.unsure[word] = ZERO
+        # Only words that have samples: most pairs have one sample, and their branches are foreseen.
+        words = np.int64(w0 != ZERO) | np.int64(w1 != ZERO) << 1
+        words |= np.int64(w2 != ZERO) << 2 | np.int64(w3 != ZERO) << 3
+        while words != 0:
+            word = lowest_bit(np.uint64(words))
+            words &= words - 1
             wanted = scratch.wanted[pair, word]
             blocked = ZERO
             unsure = ZERO

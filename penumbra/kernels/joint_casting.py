@@ -24,7 +24,7 @@ from penumbra.kernels.lanes import (
     to_integers,
 )
 
-N_BINS = 64
+N_BINS = 128
 _FAR = np.float32(1e25)
 _LAST_BIN = np.float32(N_BINS - 1)
 _NEAR = np.float32(1e-20)
