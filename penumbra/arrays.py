@@ -166,6 +166,7 @@ class LightSpace(NamedTuple):
 
     matrix: Float64Array  # (3, 3) and
     origin: Float64Array  # (3,): light space = matrix (world - origin); z > 0 on the receivers' side
+    handedness: float  # 1 where the map keeps right-handed triples so, otherwise -1
     parameters: Float32Array  # (S, B, 2, 256) s and t of the samples; copies of the last one fill up
     tables: UInt64Array  # (S + 1, B, 4, 128, 4)
     extents: Float32Array  # (B, 6) least s, least t, greatest s, greatest t of all sets; bins per s, per t
@@ -219,5 +220,5 @@ class JointScratch(NamedTuple):
     unsure: UInt64Array  # (4,) samples that float32 leaves open
     bins: Int32Array  # (4, 4, 16) by level, the last of a leaf: first and last bin of s, and of t
     cluster: Float32Array  # (5, 16) first corners from the centre of the leaf; bounds of plane, of edges
-    coefficients: Float32Array  # (14, 16) A, B, C of three edges, bound; C, A, B of the plane, bound
+    coefficients: Float32Array  # (15, 16) A, B, C of three edges, bound; A, B, C of the plane, bound; turn
     normal: Float64Array  # (6,)

@@ -184,7 +184,7 @@ def _scratch() -> JointScratch:
         unsure=np.zeros(4, np.uint64),
         bins=np.zeros((4, 4, 16), np.int32),
         cluster=np.zeros((5, 16), np.float32),
-        coefficients=np.zeros((14, 16), np.float32),
+        coefficients=np.zeros((15, 16), np.float32),
         normal=np.zeros(6),
     )
 

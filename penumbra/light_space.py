@@ -42,6 +42,7 @@ def light_space(light: RectLight, side: float, points: Float64Array, bounds: Flo
     return LightSpace(
         matrix=matrix,
         origin=origin,
+        handedness=1.0 if np.linalg.det(matrix) > 0 else -1.0,
         parameters=np.ascontiguousarray(np.moveaxis(blocks, -1, 2)),
         tables=_tables(blocks, extents, light.samples),
         extents=extents,

@@ -129,6 +129,24 @@ def decide_samples(tree, leaves, light, block, cluster, lanes, row, slot, scratc
                     )
 
 
+@helper
+def turn_lane(tree, leaves, light, cluster, lane, row, scratch, counters):
+    """Turn one blocker of scratch.coefficients by the receiver's exact side of it; False: it is in the plane."""
+    tree, leaves, light = borrow(tree), borrow(leaves), borrow(light)
+    scratch, counters = borrow(scratch), borrow(counters)
+    counters[PAIRS_ESCALATED] += 1
+    tri = tree.vertices[cluster * 16 + lane]
+    fill_normal(tri, scratch.normal)
+    x, y, z = leaves.points[row, 0], leaves.points[row, 1], leaves.points[row, 2]
+    side = receiver_side(tri, scratch.normal, x, y, z, counters)
+    c = scratch.coefficients
+    if float(c[14, lane]) * float(side) * light.handedness > 0.0:
+        for k in range(13):
+            if k != 9:
+                c[k, lane] = -c[k, lane]
+    return side != 0
+
+
 @inlined
 def _own_lane(tree, cluster, own):
     """Bit of the receiver's own triangle, if it is in the cluster."""
@@ -231,7 +249,8 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, 
             )
             askew = (within | bits_not_below(bound + bound, least)) & fast & ~sided
     own = leaves.own[row]
-    alive &= ~_own_lane(tree, cluster, own)
+    not_own = ~_own_lane(tree, cluster, own)
+    alive &= not_own
     straddling &= alive
     plain = alive & ~straddling
     coefficients = scratch.coefficients
@@ -277,7 +296,8 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, 
             scratch.unsure[word] = unsure
             unsure_words |= unsure
             scratch.open[slot, word] &= ~blocked
-    if unsure_words != ZERO or by_lane | straddling != 0:
+    askew &= not_own
+    if unsure_words != ZERO or by_lane | straddling | askew != 0:
         store(coefficients, 0, a0)
         store(coefficients, 16, b0)
         store(coefficients, 32, c0)
@@ -288,7 +308,7 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, 
         store(coefficients, 112, b2)
         store(coefficients, 128, c2)
         store(coefficients, 144, bound)
-        if straddling != 0:
+        if tree.straddling[cluster] != 0:
             # Also the plane of the blocker: the light must lie beyond it.
             store(coefficients, 160, muladd(nx, gx, muladd(ny, gy, nz * gz)) - magnitude(height))
             store(coefficients, 176, nx)
@@ -302,14 +322,19 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, 
             )
         if unsure_words != ZERO:
             decide_samples(tree, leaves, light, block, cluster, plain, row, slot, scratch, counters)
-        by_lane |= straddling
+        if askew != 0:
+            store(coefficients, 224, turn)
+        by_lane |= straddling | askew
+        straddling = np.int64(tree.straddling[cluster])
         while by_lane != 0:
             lane = lowest_bit(np.uint64(by_lane))
             by_lane &= by_lane - 1
+            if (askew >> lane) & 1 == 1 and not turn_lane(
+                tree, leaves, light, cluster, lane, row, scratch, counters
+            ):
+                continue
             crosses = (straddling >> lane) & 1 == 1
             _cast_lane(tree, leaves, light, block, cluster, lane, crosses, row, pair, scratch, counters)
-    if askew != 0:
-        decide_lanes(tree, leaves, light, block, cluster, askew, leaf, pair, scratch, counters)
 
 
 @inlined
