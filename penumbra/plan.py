@@ -22,7 +22,8 @@ _MASK_WORD_BYTES = 16  # 64 light samples of a receiver: in the result, and at w
 _SAMPLE_BYTES = 64  # a light sample of one set, as point and as lane
 _PREVIEW_BYTES = 24  # a pixel while the picture is exposed
 _ENCODE_BYTES = 24 << 20  # buffers of the EXR encoder
-_STORE_BYTES = 48 << 20  # two chunks of 64 Ki blockers with boxes and reading buffers, the store's index
+_TREE_BYTES = 6 << 20  # a chunk of 64 Ki blockers in light space
+_STORE_BYTES = (48 << 20) + _TREE_BYTES  # two chunks of 64 Ki blockers with boxes and reading buffers, the store's index
 _READ_TRIANGLE_BYTES = 260  # a blocker while it is read and sorted in memory
 _KEPT_TRIANGLE_BYTES = 112  # a blocker in memory after that
 _KERNEL_BYTES = 96 << 20  # machine code and LLVM's own memory once every kernel is loaded
@@ -209,7 +210,9 @@ def _place_blockers(
     if geometry.is_store:
         return "store", 0, _STORE_BYTES
     read_bytes = geometry.n_triangles * _READ_TRIANGLE_BYTES
-    kept_bytes = geometry.n_triangles * _KEPT_TRIANGLE_BYTES
+    kept_bytes = geometry.n_triangles * _KEPT_TRIANGLE_BYTES + min(
+        _TREE_BYTES, geometry.n_triangles * _KEPT_TRIANGLE_BYTES
+    )
     # Half of what is free at most: the other half makes the passes few.
     if read_bytes <= free and kept_bytes <= min(free // 2, free - least_pass_bytes):
         return "memory", read_bytes, kept_bytes
