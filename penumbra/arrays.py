@@ -197,7 +197,7 @@ class ReceiverLeaves(NamedTuple):
 
 
 class BlockerTree(NamedTuple):
-    """A chunk in light space, 16 blockers ("cluster") to a vector, under a hierarchy of 16 children a node."""
+    """A chunk in light space: clusters of 16 blockers, one a lane, under nodes of 16 children."""
 
     lanes: Float32Array  # (C, 17, 16) see kernels/light_space.py
     lane_ids: Int32Array  # (C, 16) low half of the triangle index

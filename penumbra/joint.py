@@ -57,7 +57,9 @@ def joint_cast(
         is_here = heights_above(space, receivers.points, rest) > 8 * space.slack
         if is_here.any():
             sides.append(
-                JointReceivers(rest[is_here], receivers, start, space, float(np.abs(blockers.bounds).max()), threads)
+                JointReceivers(
+                    rest[is_here], receivers, start, space, float(np.abs(blockers.bounds).max()), threads
+                )
             )
         rest = rest[~is_here]
     return JointCast(sides, rest)
@@ -151,7 +153,9 @@ class JointReceivers:
             vertices=chunk.vertices,
             ids=chunk.ids,
         )
-        run_tasks(lambda part: fill_tree_part(tree, self.light, self._deepest, part), range(n_middle), threads)
+        run_tasks(
+            lambda part: fill_tree_part(tree, self.light, self._deepest, part), range(n_middle), threads
+        )
         return tree
 
 
@@ -187,4 +191,3 @@ def _scratch() -> JointScratch:
         coefficients=np.zeros((15, 16), np.float32),
         normal=np.zeros(6),
     )
-

@@ -13,7 +13,9 @@ _U32 = 2.0**-24
 _LARGEST_RESIDUAL = 2.0**-14
 
 
-def light_space(light: RectLight, side: float, points: Float64Array, bounds: Float64Array) -> LightSpace | None:
+def light_space(
+    light: RectLight, side: float, points: Float64Array, bounds: Float64Array
+) -> LightSpace | None:
     """Light space of a light for receivers on one side (1: the one it emits to, or -1).
 
     points (R, 3): the receivers; bounds (2, 3): of the blockers. None where the light has no such space
@@ -33,7 +35,9 @@ def light_space(light: RectLight, side: float, points: Float64Array, bounds: Flo
         placed = (samples - origin) @ matrix.T
         reach = max(1.0, float((np.abs(matrix) @ np.abs(corners - origin).max(axis=0)).max()))
     lanes = placed[..., :2].astype(np.float32)
-    residual = float(max(np.abs(placed[..., :2] - lanes).max() - _U32, np.abs(placed[..., 2]).max())) + world_error
+    residual = (
+        float(max(np.abs(placed[..., :2] - lanes).max() - _U32, np.abs(placed[..., 2]).max())) + world_error
+    )
     slack = 4 * _U32 * reach + 2 * world_error + residual
     if not (residual < _LARGEST_RESIDUAL and reach < 2.0**30 and np.isfinite(slack)):
         return None
@@ -69,7 +73,10 @@ def _matrix(light: RectLight, side: float) -> Float64Array | None:
     with np.errstate(all="ignore"):
         normal = np.cross(light.edge_u, light.edge_v)
         lengths = [float(np.linalg.norm(v)) for v in (light.edge_u, light.edge_v, normal)]
-        if not all(1e-60 < length < 1e60 for length in lengths) or lengths[2] < 1e-6 * lengths[0] * lengths[1]:
+        if (
+            not all(1e-60 < length < 1e60 for length in lengths)
+            or lengths[2] < 1e-6 * lengths[0] * lengths[1]
+        ):
             return None
         axes = np.stack([light.edge_u, light.edge_v, side * normal / np.sqrt(lengths[2])], axis=1)
         matrix: Float64Array = np.ascontiguousarray(np.linalg.inv(axes))

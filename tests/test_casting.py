@@ -19,7 +19,6 @@ from penumbra.lights import RectLight, sample_sets_of
 from penumbra.options import CastOptions
 from penumbra.receivers import ReceiverTile, split_into_tiles
 
-
 # No joint descent of receivers and blockers: what the switches are about.
 ONE_AT_A_TIME = CastOptions(joint_triangles=1 << 40)
 

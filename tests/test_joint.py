@@ -32,7 +32,9 @@ def receivers_at(points: np.ndarray, own: np.ndarray | None = None) -> Receivers
 
 def sides_of(points: np.ndarray, light: RectLight, triangles: np.ndarray) -> list[JointReceivers]:
     receivers = receivers_at(points)
-    return joint_cast(receivers, face_light(receivers, light, 32), light, blockers_in_memory(triangles), 1).sides
+    return joint_cast(
+        receivers, face_light(receivers, light, 32), light, blockers_in_memory(triangles), 1
+    ).sides
 
 
 def both_ways(points: np.ndarray, triangles: np.ndarray, light: RectLight, **arguments: object) -> dict:
@@ -78,7 +80,9 @@ def test_light_space_takes_the_samples_to_the_unit_square(name):
     light = LIGHTS[name]
     points = np.array([[0.0, 0, 0], [1, 1, 1]])
     space = light_space(light, 1.0, points, points)
-    corners = light.corner + np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ np.stack([light.edge_u, light.edge_v])
+    corners = light.corner + np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ np.stack(
+        [light.edge_u, light.edge_v]
+    )
     placed = (corners - space.origin) @ space.matrix.T
     assert np.allclose(placed[:, :2], [[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]], atol=1e-9)
     assert np.abs(placed[:, 2]).max() < 1e-9

@@ -28,9 +28,7 @@ def cast_both() -> np.ndarray:
     options = penumbra.CastOptions(tile_receivers=30, leaf_receivers=4, rebuild_fraction=0.1)
     masks = []
     for backend in BACKENDS:
-        result = penumbra.cast(
-            points, blockers, light, normals=normals, threads=1, **way(backend, options)
-        )
+        result = penumbra.cast(points, blockers, light, normals=normals, threads=1, **way(backend, options))
         masks.append(result.masks)
     return np.array(masks)
 

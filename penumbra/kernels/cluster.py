@@ -2,7 +2,7 @@
 
 Seen from receiver r, edge k of a blocker is the function n_k . (l - r) of sample l, n_k = (v_k - r) x e_k.
 Sample l is blocked where all three have the sign of (v - r) . (v_1 - v_0) x (v_2 - v_1): then the line
-r l meets the blocker, and meets it ahead of r; and before l, since a fast lane lies wholly in front of the light. 
+r l meets the blocker, and meets it ahead of r; and before l, since a fast lane lies wholly in front of the light.
 
 Rounding, in units of u = 2**-24 times (|w| + E) E G, w = v_0 - r, E the length of the edges, G >= |l - r|:
 w (from the centre of the leaf, then from the receiver, |w| the sum of both) 3.1 and its edge 1, products
@@ -178,7 +178,9 @@ def prepare_cluster(tree, leaves, light, cluster, leaf, scratch):
     size = (magnitude(wx) + magnitude(wy)) + (magnitude(wz) + radius)
     length = load(lanes, first + 240)
     tilt = load(lanes, first + 256) * splat(np.float32(8.0 * _ROUNDOFF))
-    factor = np.float32(np.float32(32.0 * _ROUNDOFF) * leaves.reaches[leaf, 1] + np.float32(4.0 * light.residual))
+    factor = np.float32(
+        np.float32(32.0 * _ROUNDOFF) * leaves.reaches[leaf, 1] + np.float32(4.0 * light.residual)
+    )
     store(scratch.cluster, 0, wx)
     store(scratch.cluster, 16, wy)
     store(scratch.cluster, 32, wz)

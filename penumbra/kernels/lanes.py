@@ -178,7 +178,7 @@ def _library(name: str, n_arguments: int) -> Any:
 
 @intrinsic
 def _muladd(typingctx: Any, x: Any, y: Any, z: Any) -> tuple[Any, Codegen]:
-    """x * y + z, fused where the processor does that in one step."""
+    """X * y + z, fused where the processor does that in one step."""
     return x(x, y, z), _library("llvm.fmuladd", 3)
 
 
@@ -251,7 +251,9 @@ if numba.config.DISABLE_JIT:
 
     def load(array, offset):
         """Lanes from a C-contiguous array, from a flat element offset on."""
-        return array.reshape(-1)[offset : offset + {"f4": 16, "i4": 16, "f8": 8, "u8": 4}[array.dtype.str[1:]]]
+        return array.reshape(-1)[
+            offset : offset + {"f4": 16, "i4": 16, "f8": 8, "u8": 4}[array.dtype.str[1:]]
+        ]
 
     def store(array, offset, lanes):
         """Put lanes into a C-contiguous array, from a flat element offset on."""
@@ -285,7 +287,7 @@ if numba.config.DISABLE_JIT:
         return _packed(left == right)
 
     def muladd(x, y, z):
-        """x * y + z by lane, fused or not."""
+        """X * y + z by lane, fused or not."""
         return x * y + z
 
     def magnitude(x):
@@ -293,7 +295,7 @@ if numba.config.DISABLE_JIT:
         return np.abs(x)
 
     def with_sign(x, sign):
-        """x by lane, with the sign of `sign`."""
+        """X by lane, with the sign of `sign`."""
         return np.copysign(x, sign)
 
     def choose(bits, x, y):

@@ -47,7 +47,11 @@ def _fill_lane(tri, matrix, origin, lanes, cluster, lane, box):
                 lanes[cluster, row, lane] = high
                 lanes[cluster, 3 + row, lane] = np.float32(place - np.float64(high))
             length += abs(matrix[row, 0] * ux) + abs(matrix[row, 1] * uy) + abs(matrix[row, 2] * uz)
-        edge = (_mapped(matrix, ux, uy, uz, 0), _mapped(matrix, ux, uy, uz, 1), _mapped(matrix, ux, uy, uz, 2))
+        edge = (
+            _mapped(matrix, ux, uy, uz, 0),
+            _mapped(matrix, ux, uy, uz, 1),
+            _mapped(matrix, ux, uy, uz, 2),
+        )
         if k == 0:
             edges = (edge, edge, edge)
         elif k == 1:
