@@ -23,9 +23,8 @@ _SAMPLE_BYTES = 64  # a light sample of one set, as point and as lane
 _PREVIEW_BYTES = 24  # a pixel while the picture is exposed
 _ENCODE_BYTES = 24 << 20  # buffers of the EXR encoder
 _TREE_BYTES = 6 << 20  # a chunk of 64 Ki blockers in light space
-_STORE_BYTES = (
-    48 << 20
-) + _TREE_BYTES  # two chunks of 64 Ki blockers with boxes and reading buffers, the store's index
+# Two chunks of 64 Ki blockers with boxes and reading buffers, the store's index, a chunk in light space.
+_STORE_BYTES = (48 << 20) + _TREE_BYTES
 _READ_TRIANGLE_BYTES = 260  # a blocker while it is read and sorted in memory
 _KEPT_TRIANGLE_BYTES = 112  # a blocker in memory after that
 _KERNEL_BYTES = 96 << 20  # machine code and LLVM's own memory once every kernel is loaded

@@ -18,7 +18,7 @@ from penumbra.lights import RectLight
 from penumbra.options import CastOptions
 
 LIGHTS = {
-    "square": RectLight([-0.5, 3, 0.5], [1, 0, 0], [0, 0, 1], samples=256, sets=3),
+    "square": RectLight([-0.5, 3, -0.5], [1, 0, 0], [0, 0, 1], samples=256, sets=3),
     "skewed": RectLight([-1, 2, -1], [2, 0.3, 0], [0.7, 0.2, 2], samples=300, sets=2),
     "narrow": RectLight([0, 3, 0], [1, 0, 0], [0, 0, 1e-3], samples=70, sets=1),
     "far": RectLight([1000, 3000, 1000], [1, 0, 0], [0, 0, 1], samples=64, sets=2),
@@ -119,7 +119,7 @@ def _lanes(places, axis):
 
 def test_projected_boxes_keep_every_sample_that_a_point_inside_blocks(rng):
     """Points of a box are put on segments from receivers to samples: those samples must be kept."""
-    light = RectLight([-0.5, 3, 0.5], [1, 0, 0], [0, 0, 1], samples=256, sets=1)
+    light = RectLight([-0.5, 3, -0.5], [1, 0, 0], [0, 0, 1], samples=256, sets=1)
     receivers = rng.uniform(-2, 2, (64, 3)) * [1, 0.5, 1]
     space = light_space(light, 1.0, receivers, np.array([[-3.0, -3, -3], [3, 3, 3]]))
     kept = wanted = 0
@@ -129,7 +129,8 @@ def test_projected_boxes_keep_every_sample_that_a_point_inside_blocks(rng):
         sample = rng.integers(0, 256)
         lane = rng.integers(0, 16)
         target = np.append(space.parameters[0, 0, :, sample].astype(float), 0)
-        middle = r[lane] + rng.choice([1e-6, 0.01, 0.3, 0.9]) * (target - r[lane])
+        share = rng.choice([1e-6, 0.01, 0.3, 0.9])
+        middle = r[lane] + share * (target - r[lane])
         low, high = middle - spread * rng.random(3), middle + spread * rng.random(3)
         reach = 2.0**-22 * (np.abs(low) + np.abs(high)) + space.slack
         box = np.concatenate([low - reach, high + reach]).astype(np.float32)
@@ -137,20 +138,22 @@ def test_projected_boxes_keep_every_sample_that_a_point_inside_blocks(rng):
         words = np.zeros((16, 4), np.uint64)
         places = np.ascontiguousarray(r.T, dtype=np.float32)
         _covered(
-            box, places, space.extents[0], np.float32(space.border), space.tables, np.zeros((1, 4, 16), np.int32),
-            words,
+            box, places, space.extents[0], np.float32(space.border), space.tables,
+            np.zeros((1, 4, 16), np.int32), words,
         )  # fmt: skip
         bits = np.unpackbits(words.view(np.uint8), bitorder="little").reshape(16, 256)
         assert bits[lane, sample]
-        kept += bits[lane].sum()
-        wanted += 1
-    assert kept < 0.3 * 256 * wanted  # and the test tells samples apart
+        if share >= 0.3 and spread <= 1e-4:
+            kept += bits[lane].sum()
+            wanted += 1
+    # And boxes that are points but for rounding keep few other samples.
+    assert kept < 3 * wanted
     assert N_BINS <= 256
 
 
 def test_edges_through_samples_are_decided_beyond_float32(rng):
     """Corners on segments from receivers to samples: float32 cannot tell on which side those samples are."""
-    light = RectLight([-0.5, 3, 0.5], [1, 0, 0], [0, 0, 1], samples=64, sets=1)
+    light = RectLight([-0.5, 3, -0.5], [1, 0, 0], [0, 0, 1], samples=64, sets=1)
     points = rng.uniform(-1, 1, (48, 3)) * [1, 0, 1]
     samples = light.sample_points[0]
     receiver, sample = rng.integers(0, 48, (90, 3)), rng.integers(0, 64, (90, 3))
@@ -175,7 +178,7 @@ def test_coincident_coplanar_and_straddling_blockers(rng):
     points += rng.choice([0, 1e-15, -1e-15, 1e-5], points.shape)
     own = np.repeat(np.arange(len(triangles)), 4)
     for two_sided in (False, True):
-        light = RectLight([-0.5, 3, 0.5], [1, 0, 0], [0, 0, -1], samples=100, sets=2, two_sided=two_sided)
+        light = RectLight([-0.5, 3, -0.5], [1, 0, 0], [0, 0, 1], samples=100, sets=2, two_sided=two_sided)
         counters = both_ways(points, triangles, light, own=own)
         assert counters["pairs_escalated"] > 0
 

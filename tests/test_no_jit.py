@@ -20,7 +20,7 @@ with np.errstate(all="ignore"):  # words of masks wrap around, and unused lanes 
 
 
 def cast_both() -> np.ndarray:
-    """Masks of a small scene by every way to cast it, uint64 (3, R, n_words); small leaves, tiles and pools."""
+    """Masks of a small scene by every way to cast it, uint64 (3, R, n_words); all parts small."""
     rng = np.random.default_rng(7)
     blockers = rng.uniform(-1, 1, (60, 1, 3)) + rng.normal(size=(60, 3, 3)) * 0.4
     points, normals = rng.uniform(-2, 2, (40, 3)), rng.normal(size=(40, 3))

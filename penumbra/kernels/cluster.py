@@ -2,7 +2,8 @@
 
 Seen from receiver r, edge k of a blocker is the function n_k . (l - r) of sample l, n_k = (v_k - r) x e_k.
 Sample l is blocked where all three have the sign of (v - r) . (v_1 - v_0) x (v_2 - v_1): then the line
-r l meets the blocker, and meets it ahead of r; and before l, since a fast lane lies wholly in front of the light.
+r l meets the blocker, and meets it ahead of r. It meets it before l, too, unless the blocker may reach the
+plane of the light: such blockers have a fourth function.
 
 Rounding, in units of u = 2**-24 times (|w| + E) E G, w = v_0 - r, E the length of the edges, G >= |l - r|:
 w (from the centre of the leaf, then from the receiver, |w| the sum of both) 3.1 and its edge 1, products
@@ -131,7 +132,7 @@ def decide_samples(tree, leaves, light, block, cluster, lanes, row, slot, scratc
 
 @helper
 def turn_lane(tree, leaves, light, cluster, lane, row, scratch, counters):
-    """Turn one blocker of scratch.coefficients by the receiver's exact side of it; False: it is in the plane."""
+    """Turn a blocker of scratch.coefficients by the receiver's exact side; False: it is in the plane."""
     tree, leaves, light = borrow(tree), borrow(leaves), borrow(light)
     scratch, counters = borrow(scratch), borrow(counters)
     counters[PAIRS_ESCALATED] += 1
@@ -189,154 +190,178 @@ def prepare_cluster(tree, leaves, light, cluster, leaf, scratch):
 
 
 @inlined
+def _functions(w, n, turn, lanes, first, g):
+    """A, B, C of the three edges; each blocker turned (1 or -1) so that it is seen from its back.
+
+    w: first corners from the receiver; n: normals; g: centre of the light from the receiver.
+    """
+    wx, wy, wz = w[0] * turn, w[1] * turn, w[2] * turn
+    nx, ny, nz = n[0] * turn, n[1] * turn, n[2] * turn
+    ex, ey, ez = load(lanes, first + 96), load(lanes, first + 112), load(lanes, first + 128)
+    b0, c0, d0 = wy * ez - wz * ey, wz * ex - wx * ez, wx * ey - wy * ex
+    ex, ey, ez = load(lanes, first + 144), load(lanes, first + 160), load(lanes, first + 176)
+    b2, c2, d2 = wy * ez - wz * ey, wz * ex - wx * ez, wx * ey - wy * ex
+    b1, c1, d1 = (nx - b0) - b2, (ny - c0) - c2, (nz - d0) - d2
+    a0 = muladd(b0, g[0], muladd(c0, g[1], d0 * g[2]))
+    a1 = muladd(b1, g[0], muladd(c1, g[1], d1 * g[2]))
+    a2 = muladd(b2, g[0], muladd(c2, g[1], d2 * g[2]))
+    return a0, b0, c0, a1, b1, c1, a2, b2, c2
+
+
+@inlined
+def _reached(functions, bound, bins, slot, extent):
+    """Lanes whose functions may all be >= 0 at once, and all <= 0, among the samples in a receiver's bins."""
+    a0, b0, c0, a1, b1, c1, a2, b2, c2 = functions
+    s0 = splat(extent[0] + (np.float32(bins[3, 0, slot]) - _MARGIN) / extent[4])
+    s1 = splat(extent[0] + (np.float32(bins[3, 1, slot]) + _NEXT) / extent[4])
+    t0 = splat(extent[1] + (np.float32(bins[3, 2, slot]) - _MARGIN) / extent[5])
+    t1 = splat(extent[1] + (np.float32(bins[3, 3, slot]) + _NEXT) / extent[5])
+    most = lesser(
+        lesser(
+            a0 + greater(b0 * s0, b0 * s1) + greater(c0 * t0, c0 * t1),
+            a1 + greater(b1 * s0, b1 * s1) + greater(c1 * t0, c1 * t1),
+        ),
+        a2 + greater(b2 * s0, b2 * s1) + greater(c2 * t0, c2 * t1),
+    )
+    least = greater(
+        greater(
+            a0 + lesser(b0 * s0, b0 * s1) + lesser(c0 * t0, c0 * t1),
+            a1 + lesser(b1 * s0, b1 * s1) + lesser(c1 * t0, c1 * t1),
+        ),
+        a2 + lesser(b2 * s0, b2 * s1) + lesser(c2 * t0, c2 * t1),
+    )
+    # Twice the bound: the sides of the rectangle are rounded as well.
+    twice = bound + bound
+    return bits_not_below(most, splat(np.float32(0.0)) - twice), bits_not_below(twice, least)
+
+
+@inlined
+def _test_cluster(functions, plain, bound, light, block, sample_set, pair, slot, scratch):
+    """Test each sample wanted against 16 blockers; fills scratch.unsure, returns whether any sample is."""
+    a0, b0, c0, a1, b1, c1, a2, b2, c2 = functions
+    a0 = choose(plain, a0, splat(_NEVER))
+    below = splat(np.float32(0.0)) - bound
+    parameters = light.parameters
+    any_unsure = ZERO
+    # Only words that have samples: most pairs have one sample, and their branches are foreseen.
+    words = np.int64(0)
+    for word in range(4):
+        scratch.unsure[word] = ZERO
+        words |= np.int64(scratch.wanted[pair, word] != ZERO) << word
+    while words != 0:
+        word = lowest_bit(np.uint64(words))
+        words &= words - 1
+        wanted = scratch.wanted[pair, word]
+        blocked = ZERO
+        unsure = ZERO
+        while wanted != ZERO:
+            bit = lowest_bit(wanted)
+            only = wanted & (~wanted + ONE)
+            wanted ^= only
+            s = splat(parameters[sample_set, block, 0, word * 64 + bit])
+            t = splat(parameters[sample_set, block, 1, word * 64 + bit])
+            f = lesser(
+                lesser(muladd(b0, s, muladd(c0, t, a0)), muladd(b1, s, muladd(c1, t, a1))),
+                muladd(b2, s, muladd(c2, t, a2)),
+            )
+            # Without a branch: whether a sample is blocked is a coin toss.
+            blocked |= only if bits_above(f, bound) != 0 else ZERO
+            unsure |= only if bits_not_below(f, below) != 0 else ZERO
+        unsure &= ~blocked
+        scratch.unsure[word] = unsure
+        any_unsure |= unsure
+        scratch.open[slot, word] &= ~blocked
+    return any_unsure != ZERO
+
+
+@inlined
+def _store_functions(functions, bound, c):
+    store(c, 0, functions[0])
+    store(c, 16, functions[1])
+    store(c, 32, functions[2])
+    store(c, 48, functions[3])
+    store(c, 64, functions[4])
+    store(c, 80, functions[5])
+    store(c, 96, functions[6])
+    store(c, 112, functions[7])
+    store(c, 128, functions[8])
+    store(c, 144, bound)
+
+
+@inlined
 def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, counters):
     """Clear the open samples of a receiver that a cluster blocks, of those in scratch.wanted[pair]."""
     slot = np.int64(scratch.slots[pair])
     row = leaves.row[leaf * 16 + slot]
     counters[CLUSTER_PAIRS] += 1
     first = cluster * (N_LANES * 16)
-    lanes = tree.lanes
-    rx, ry, rz = leaves.places[leaf, 0, slot], leaves.places[leaf, 1, slot], leaves.places[leaf, 2, slot]
-    wx = load(scratch.cluster, 0) - splat(leaves.offsets[leaf, 0, slot])
-    wy = load(scratch.cluster, 16) - splat(leaves.offsets[leaf, 1, slot])
-    wz = load(scratch.cluster, 32) - splat(leaves.offsets[leaf, 2, slot])
-    bound = load(scratch.cluster, 64)
-    below = splat(np.float32(0.0)) - bound
-    nx, ny, nz = load(lanes, first + 192), load(lanes, first + 208), load(lanes, first + 224)
-    height = muladd(wx, nx, muladd(wy, ny, wz * nz))
+    w = (
+        load(scratch.cluster, 0) - splat(leaves.offsets[leaf, 0, slot]),
+        load(scratch.cluster, 16) - splat(leaves.offsets[leaf, 1, slot]),
+        load(scratch.cluster, 32) - splat(leaves.offsets[leaf, 2, slot]),
+    )
+    places = leaves.places
+    g = (splat(-places[leaf, 0, slot]), splat(-places[leaf, 1, slot]), splat(-places[leaf, 2, slot]))
+    n = (load(tree.lanes, first + 192), load(tree.lanes, first + 208), load(tree.lanes, first + 224))
+    height = muladd(w[0], n[0], muladd(w[1], n[1], w[2] * n[2]))
     fast = np.int64(tree.fast[cluster])
     sided = bits_above(magnitude(height), load(scratch.cluster, 48)) & fast
-    # Turn each blocker so that it is seen from its back, without a branch.
     turn = with_sign(splat(np.float32(1.0)), height)
-    wx, wy, wz = wx * turn, wy * turn, wz * turn
-    nx, ny, nz = nx * turn, ny * turn, nz * turn
-    ex, ey, ez = load(lanes, first + 96), load(lanes, first + 112), load(lanes, first + 128)
-    b0, c0, d0 = wy * ez - wz * ey, wz * ex - wx * ez, wx * ey - wy * ex
-    ex, ey, ez = load(lanes, first + 144), load(lanes, first + 160), load(lanes, first + 176)
-    b2, c2, d2 = wy * ez - wz * ey, wz * ex - wx * ez, wx * ey - wy * ex
-    b1, c1, d1 = (nx - b0) - b2, (ny - c0) - c2, (nz - d0) - d2
-    gx, gy, gz = splat(-rx), splat(-ry), splat(-rz)
-    a0 = muladd(b0, gx, muladd(c0, gy, d0 * gz))
-    a1 = muladd(b1, gx, muladd(c1, gy, d1 * gz))
-    a2 = muladd(b2, gx, muladd(c2, gy, d2 * gz))
-    w0, w1 = scratch.wanted[pair, 0], scratch.wanted[pair, 1]
-    w2, w3 = scratch.wanted[pair, 2], scratch.wanted[pair, 3]
-    n_wanted = (popcount64(w0) + popcount64(w1)) + (popcount64(w2) + popcount64(w3))
-    straddling = np.int64(tree.straddling[cluster])
-    alive = sided
+    functions = _functions(w, n, turn, tree.lanes, first, g)
+    bound = load(scratch.cluster, 64)
+    n_wanted = popcount64(scratch.wanted[pair, 0]) + popcount64(scratch.wanted[pair, 1])
+    n_wanted += popcount64(scratch.wanted[pair, 2]) + popcount64(scratch.wanted[pair, 3])
+    crossing = np.int64(tree.straddling[cluster])
+    not_own = ~_own_lane(tree, cluster, leaves.own[row])
+    plain = sided & not_own
     askew = np.int64(0)
-    if n_wanted > _FEW or sided != fast or straddling != 0:
-        bins = scratch.bins
-        s0 = splat(extent[0] + (np.float32(bins[3, 0, slot]) - _MARGIN) / extent[4])
-        s1 = splat(extent[0] + (np.float32(bins[3, 1, slot]) + _NEXT) / extent[4])
-        t0 = splat(extent[1] + (np.float32(bins[3, 2, slot]) - _MARGIN) / extent[5])
-        t1 = splat(extent[1] + (np.float32(bins[3, 3, slot]) + _NEXT) / extent[5])
-        # The most and the least that each function reaches among the samples wanted.
-        most = lesser(
-            lesser(
-                a0 + greater(b0 * s0, b0 * s1) + greater(c0 * t0, c0 * t1),
-                a1 + greater(b1 * s0, b1 * s1) + greater(c1 * t0, c1 * t1),
-            ),
-            a2 + greater(b2 * s0, b2 * s1) + greater(c2 * t0, c2 * t1),
-        )
-        within = bits_not_below(most, below - bound)
-        alive &= within
-        if sided != fast:
-            least = greater(
-                greater(
-                    a0 + lesser(b0 * s0, b0 * s1) + lesser(c0 * t0, c0 * t1),
-                    a1 + lesser(b1 * s0, b1 * s1) + lesser(c1 * t0, c1 * t1),
-                ),
-                a2 + lesser(b2 * s0, b2 * s1) + lesser(c2 * t0, c2 * t1),
-            )
-            askew = (within | bits_not_below(bound + bound, least)) & fast & ~sided
-    own = leaves.own[row]
-    not_own = ~_own_lane(tree, cluster, own)
-    alive &= not_own
-    straddling &= alive
-    plain = alive & ~straddling
-    coefficients = scratch.coefficients
-    n_plain = popcount64(np.uint64(plain))
-    by_lane = np.int64(0)
-    if n_wanted > _SOME and n_plain * 24 < n_wanted * 2:
-        by_lane = plain
+    if n_wanted > _FEW or sided != fast or crossing != 0:
+        from_back, from_front = _reached(functions, bound, scratch.bins, slot, extent)
+        plain &= from_back
+        askew = (from_back | from_front) & fast & ~sided & not_own
+    by_lane = (plain & crossing) | askew
+    plain &= ~crossing
+    if n_wanted > _SOME and popcount64(np.uint64(plain)) * 24 < n_wanted * 2:
+        by_lane |= plain
         plain = np.int64(0)
         counters[TRIANGLE_MAJOR] += 1
-    unsure_words = ZERO
+    any_unsure = False
     if plain != 0:
-        chosen = choose(plain, a0, splat(_NEVER))
-        sample_set = np.int64(leaves.sample_set[row])
-        parameters = light.parameters
         counters[LANES_TESTED] += n_wanted * 16
-        for word in range(4):
-            scratch.unsure[word] = ZERO
-        # Only words that have samples: most pairs have one sample, and their branches are foreseen.
-        words = np.int64(w0 != ZERO) | np.int64(w1 != ZERO) << 1
-        words |= np.int64(w2 != ZERO) << 2 | np.int64(w3 != ZERO) << 3
-        while words != 0:
-            word = lowest_bit(np.uint64(words))
-            words &= words - 1
-            wanted = scratch.wanted[pair, word]
-            blocked = ZERO
-            unsure = ZERO
-            while wanted != ZERO:
-                bit = lowest_bit(wanted)
-                only = wanted & (~wanted + ONE)
-                wanted ^= only
-                s = splat(parameters[sample_set, block, 0, word * 64 + bit])
-                t = splat(parameters[sample_set, block, 1, word * 64 + bit])
-                f = lesser(
-                    lesser(muladd(b0, s, muladd(c0, t, chosen)), muladd(b1, s, muladd(c1, t, a1))),
-                    muladd(b2, s, muladd(c2, t, a2)),
-                )
-                # Without a branch: whether a sample is blocked is a coin toss.
-                possible = bits_not_below(f, below)
-                sure = bits_above(f, bound)
-                blocked |= only if sure != 0 else ZERO
-                unsure |= only if possible != 0 else ZERO
-            unsure &= ~blocked
-            scratch.unsure[word] = unsure
-            unsure_words |= unsure
-            scratch.open[slot, word] &= ~blocked
-    askew &= not_own
-    if unsure_words != ZERO or by_lane | straddling | askew != 0:
-        store(coefficients, 0, a0)
-        store(coefficients, 16, b0)
-        store(coefficients, 32, c0)
-        store(coefficients, 48, a1)
-        store(coefficients, 64, b1)
-        store(coefficients, 80, c1)
-        store(coefficients, 96, a2)
-        store(coefficients, 112, b2)
-        store(coefficients, 128, c2)
-        store(coefficients, 144, bound)
-        if tree.straddling[cluster] != 0:
-            # Also the plane of the blocker: the light must lie beyond it.
-            store(coefficients, 160, muladd(nx, gx, muladd(ny, gy, nz * gz)) - magnitude(height))
-            store(coefficients, 176, nx)
-            store(coefficients, 192, ny)
-            # The height's own bound is 8 units of |w|: 16 of |w| and |l - r|, and twice that.
-            reach = splat(leaves.reaches[leaf, 1] * np.float32(32.0 * _ROUNDOFF))
-            store(
-                coefficients,
-                208,
-                load(scratch.cluster, 48) * splat(np.float32(4.0)) + load(lanes, first + 256) * reach,
-            )
-        if unsure_words != ZERO:
+        sample_set = np.int64(leaves.sample_set[row])
+        any_unsure = _test_cluster(functions, plain, bound, light, block, sample_set, pair, slot, scratch)
+    if any_unsure or by_lane != 0:
+        c = scratch.coefficients
+        _store_functions(functions, bound, c)
+        if any_unsure:
             decide_samples(tree, leaves, light, block, cluster, plain, row, slot, scratch, counters)
-        if askew != 0:
-            store(coefficients, 224, turn)
-        by_lane |= straddling | askew
-        straddling = np.int64(tree.straddling[cluster])
-        while by_lane != 0:
-            lane = lowest_bit(np.uint64(by_lane))
-            by_lane &= by_lane - 1
-            if (askew >> lane) & 1 == 1 and not turn_lane(
-                tree, leaves, light, cluster, lane, row, scratch, counters
-            ):
-                continue
-            crosses = (straddling >> lane) & 1 == 1
-            _cast_lane(tree, leaves, light, block, cluster, lane, crosses, row, pair, scratch, counters)
+        if askew | crossing != 0:
+            # The plane of the blocker: the light must lie beyond it. Its height is known to 8 units of |w|,
+            # the rest to 16 of |w| and |l - r|; twice that.
+            store(c, 160, (muladd(n[0], g[0], muladd(n[1], g[1], n[2] * g[2])) - height) * turn)
+            store(c, 176, n[0] * turn)
+            store(c, 192, n[1] * turn)
+            reach = splat(leaves.reaches[leaf, 1] * np.float32(32.0 * _ROUNDOFF))
+            slack = load(scratch.cluster, 48) * splat(np.float32(4.0))
+            store(c, 208, slack + load(tree.lanes, first + 256) * reach)
+            store(c, 224, turn)
+        _cast_lanes(
+            tree, leaves, light, block, cluster, by_lane, askew, crossing, row, pair, scratch, counters
+        )
+
+
+@inlined
+def _cast_lanes(tree, leaves, light, block, cluster, lanes, askew, crossing, row, pair, scratch, counters):
+    """Test blockers of scratch.coefficients one by one."""
+    while lanes != 0:
+        lane = lowest_bit(np.uint64(lanes))
+        lanes &= lanes - 1
+        if (askew >> lane) & 1 == 1 and not turn_lane(
+            tree, leaves, light, cluster, lane, row, scratch, counters
+        ):
+            continue
+        crosses = (crossing >> lane) & 1 == 1
+        _cast_lane(tree, leaves, light, block, cluster, lane, crosses, row, pair, scratch, counters)
 
 
 @inlined

@@ -3,7 +3,7 @@
 Explicit vectors do not depend on what the auto-vectoriser sees in a loop, and LLVM lowers them on any
 processor: a group of 32 samples against a blocker takes 5 ns, eight planes against a box 2 ns. One
 source serves both modes: load and splat make vectors, + - * / & work on them, lesser and greater pick by
-lane, bits_above packs a comparison, choose chooses by such bits, store puts a vector into an array.
+lane, bits_above packs a comparison, choose picks by such bits, store puts a vector into an array.
 """
 
 import operator
@@ -178,7 +178,7 @@ def _library(name: str, n_arguments: int) -> Any:
 
 @intrinsic
 def _muladd(typingctx: Any, x: Any, y: Any, z: Any) -> tuple[Any, Codegen]:
-    """X * y + z, fused where the processor does that in one step."""
+    """Return x * y + z, fused where the processor does that in one step."""
     return x(x, y, z), _library("llvm.fmuladd", 3)
 
 
@@ -287,7 +287,7 @@ if numba.config.DISABLE_JIT:
         return _packed(left == right)
 
     def muladd(x, y, z):
-        """X * y + z by lane, fused or not."""
+        """Return x * y + z by lane, fused or not."""
         return x * y + z
 
     def magnitude(x):
@@ -295,7 +295,7 @@ if numba.config.DISABLE_JIT:
         return np.abs(x)
 
     def with_sign(x, sign):
-        """X by lane, with the sign of `sign`."""
+        """Return x by lane, with the sign of `sign`."""
         return np.copysign(x, sign)
 
     def choose(bits, x, y):
