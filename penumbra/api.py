@@ -178,8 +178,8 @@ def _blocker_bytes(blockers: Blockers | Float64Array) -> int:
     """Memory that the blockers take in this call: an array is sorted, of a store two chunks are held."""
     if isinstance(blockers, np.ndarray):
         return array_bytes(len(blockers))
-    # Two chunks at a time, each as it is read and as float64.
-    return 4 * max((chunk.n_bytes for chunk in blockers.chunks), default=0)
+    # Two chunks at a time, each as it is read and as float64, and one in light space.
+    return 5 * max((chunk.n_bytes for chunk in blockers.chunks), default=0)
 
 
 def _chunk_triangles(blockers: Blockers | Float64Array) -> int:

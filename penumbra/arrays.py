@@ -208,3 +208,71 @@ class CastSwitches(NamedTuple):
     active_planes: bool
     lazy_volumes: bool
     lazy_masks: bool
+
+
+class LightSpace(NamedTuple):
+    """A light for the joint descent: an affine map that takes it to the square |s|, |t| <= 1/2 at z = 0.
+
+    K samples in B blocks of 256 consecutive bits, S sets. A table holds, for each of 128 bins of a block's
+    extent along s or t, the samples in that bin or beyond: [set][block][kind][bin] is four words, kind
+    0: s from this bin on, 1: s up to this bin, 2 and 3: the same of t. Set S stands for all sets.
+    """
+
+    matrix: Float64Array  # (3, 3) and
+    origin: Float64Array  # (3,): light space = matrix (world - origin); z > 0 on the receivers' side
+    handedness: float  # 1 where the map keeps right-handed triples so, otherwise -1
+    parameters: Float32Array  # (S, B, 2, 256) s and t of the samples; copies of the last one fill up
+    tables: UInt64Array  # (S + 1, B, 4, 128, 4)
+    extents: Float32Array  # (B, 6) least s, least t, greatest s, greatest t of all sets; bins per s, per t
+    points: Float64Array  # (S, 256 B, 3) the samples themselves, world space
+    full: UInt64Array  # (B, 4) bits that stand for samples
+    n_words: int  # words of a mask
+    slack: float  # how far a receiver, a blocker or a sample may be from its float32 place in light space
+    doubt: float  # 2**24 times how far it may be from its place as the sum of two float32
+    residual: float  # how far a sample may be from (s, t, 0), beyond the rounding of s and t
+    border: float  # what is added to an interval over the light for the rounding of its ends
+
+
+class ReceiverLeaves(NamedTuple):
+    """Receivers in leaves of 16, in the order of a curve: one lane each. N leaves, n receivers."""
+
+    places: Float32Array  # (N, 3, 16) light space
+    offsets: Float32Array  # (N, 3, 16) from the centre, which is not rounded to a float32 first
+    centres: Float32Array  # (N, 6) centre as a float32, and what that leaves out
+    reaches: Float32Array  # (N, 2) largest offset, largest distance from a sample (sums of absolute values)
+    boxes: Float32Array  # (N, 6) min and max of `places`
+    count: Int32Array  # (N,) receivers; lanes beyond are copies of the last
+    is_done: UInt8Array  # (N,) nothing is left to block
+    row: Int64Array  # (16 N,) row of the receiver in points, masks, ...
+    points: Float64Array  # (R, 3) world space, by row
+    own: Int64Array  # (R,)
+    sample_set: UInt8Array  # (R,)
+    masks: UInt64Array  # (R, n_words)
+
+
+class BlockerTree(NamedTuple):
+    """A chunk in light space: clusters of 16 blockers, one a lane, under nodes of 16 children."""
+
+    lanes: Float32Array  # (C, 17, 16) see kernels/light_space.py
+    lane_ids: Int32Array  # (C, 16) low half of the triangle index
+    fast: Int32Array  # (C,) bit per lane: may be decided in light space
+    straddling: Int32Array  # (C,) bit per lane: of those, may reach the plane of the light or beyond
+    careful: Int32Array  # (C,) bit per lane: must be decided in world space
+    nodes: Float32Array  # (M, 6, 16) boxes of 16 children; levels one after the other, clusters first
+    first_node: Int64Array  # (4,) first node of levels 0, 1, 2 (children of 16, 256, 4096 blockers); M
+    vertices: Float64Array  # (n, 3, 3) the chunk's
+    ids: Int64Array  # (n,)
+
+
+class JointScratch(NamedTuple):
+    """Working memory of one thread of the joint descent."""
+
+    open: UInt64Array  # (17, 4) samples of the block not blocked yet, of 16 receivers and of any of them
+    wanted: UInt64Array  # (17, 4) samples in question, of each receiver that has any
+    slots: Int64Array  # (17,) which receivers of the leaf those are
+    tables: Int64Array  # (16,) where in LightSpace.tables the sample set of each receiver begins
+    unsure: UInt64Array  # (4,) samples that float32 leaves open
+    bins: Int32Array  # (4, 4, 16) by level, the last of a leaf: first and last bin of s, and of t
+    cluster: Float32Array  # (5, 16) first corners from the centre of the leaf; bounds of plane, of edges
+    coefficients: Float32Array  # (15, 16) A, B, C of three edges, bound; A, B, C of the plane, bound; turn
+    normal: Float64Array  # (6,)

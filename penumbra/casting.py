@@ -17,6 +17,7 @@ from penumbra.arrays import (
 from penumbra.blockers import Blockers, prefetch
 from penumbra.executors.threads import run_tasks
 from penumbra.facing import CastStart, face_light, full_mask
+from penumbra.joint import JointCast, JointReceivers, joint_cast
 from penumbra.kernels.casting import DONE, POOL_EMPTY, REBUILD, cast_blockers
 from penumbra.kernels.counters import N_COUNTERS, NAMES
 from penumbra.kernels.point_casting import cast_blockers_from_point
@@ -48,15 +49,21 @@ def cast_receivers(
     stats = Stats("hpc")
     with stats.timed("hierarchy"):
         start = face_light(receivers, light, options.group_size)
-        extent = float(np.abs(blockers.bounds).max()) if blockers.n_triangles else 0.0
+        joint = JointCast([], start.live)
         is_point = isinstance(light, PointLight)
-        tiles = _make_tiles(receivers, start, extent, options, threads, has_masks=not is_point)
+        if not isinstance(light, PointLight) and blockers.n_triangles >= max(1, options.joint_triangles):
+            joint = joint_cast(receivers, start, light, blockers, threads)
+        extent = float(np.abs(blockers.bounds).max()) if blockers.n_triangles else 0.0
+        rest = start._replace(live=joint.rest)
+        tiles = _make_tiles(receivers, rest, extent, options, threads, has_masks=not is_point)
     with stats.timed("cast"):
         cast_tile = _cast_tile_from_point if is_point else _cast_tile
-        counters = _cast_chunks(tiles, blockers, start.samples, cast_tile, options, threads, progress, stats)
+        counters = _cast_chunks(
+            joint.sides, tiles, blockers, start.samples, cast_tile, options, threads, progress, stats
+        )
     for tile in tiles:
         tile.copy_masks(start.masks)
-    _count(stats, counters, tiles, len(receivers.points) - len(start.live))
+    _count(stats, counters, joint.sides, tiles, len(receivers.points) - len(start.live))
     return start.masks, start.sample_sets, stats
 
 
@@ -96,6 +103,7 @@ def _make_tiles(
 
 
 def _cast_chunks(
+    sides: list[JointReceivers],
     tiles: list[ReceiverTile],
     blockers: Blockers,
     samples: LightSamples,
@@ -109,13 +117,17 @@ def _cast_chunks(
     counters = np.zeros((len(tiles), N_COUNTERS), np.int64)
     boxes = np.array([chunk.box for chunk in blockers.chunks]).reshape(-1, 2, 3)
     touches = np.array([tile.touches(boxes) for tile in tiles]).reshape(len(tiles), len(boxes))
+    joint_touches = [side.touches(boxes) for side in sides]
     order = range(len(boxes)) if options.sort else range(len(boxes) - 1, -1, -1)
 
     def wanted() -> Iterator[int]:
         """Chunks that may still block something; the others are never read."""
         for number in order:
             info = blockers.chunks[number]
-            if any(touches[k, number] and tile.n_live for k, tile in enumerate(tiles)):
+            if any(touches[k, number] and tile.n_live for k, tile in enumerate(tiles)) or any(
+                (touch[:, number] & side.open_slices()).any()
+                for side, touch in zip(sides, joint_touches, strict=True)
+            ):
                 stats.count("bytes_read", info.n_bytes)
                 yield number
             else:
@@ -130,8 +142,10 @@ def _cast_chunks(
             cast_tile(tiles[k], chunk, samples, options, counters[k])
 
         run_tasks(task, work, threads)
+        for side, touch in zip(sides, joint_touches, strict=True):
+            side.cast(chunk, touch[:, number] & side.open_slices(), threads)
         progress.advance(len(chunk.ids))
-    return counters
+    return np.concatenate([counters, *(side.counters for side in sides)])
 
 
 def _cast_tile(
@@ -214,11 +228,17 @@ def _scratch(depth: int, n_groups: int) -> CastScratch:
     )
 
 
-def _count(stats: Stats, counters: np.ndarray, tiles: list[ReceiverTile], n_not_cast: int) -> None:
+def _count(
+    stats: Stats,
+    counters: np.ndarray,
+    sides: list[JointReceivers],
+    tiles: list[ReceiverTile],
+    n_not_cast: int,
+) -> None:
     for name, amount in zip(NAMES, counters.sum(axis=0), strict=True):
         stats.count(name, amount)
     stats.count("receivers_not_cast", n_not_cast)
-    stats.count("tiles", len(tiles))
+    stats.count("tiles", len(tiles) + sum(len(side.slices) for side in sides))
     stats.count("rebuilds", sum(tile.n_rebuilds for tile in tiles))
     stats.count("mask_bytes", sum(tile.pool.masks.nbytes for tile in tiles))
-    stats.count("hierarchy_bytes", sum(tile.hierarchy_bytes for tile in tiles))
+    stats.count("hierarchy_bytes", sum(part.hierarchy_bytes for part in [*sides, *tiles]))

@@ -69,6 +69,9 @@ class CastOptions:
     """Receivers in one tile, the unit of work of a thread."""
     leaf_receivers: int = 16
     """Receivers in one leaf of the receiver BVH, at most."""
+    joint_triangles: int = 0
+    """Blockers from which on the hierarchies of receivers and blockers are descended together; fewer are
+    cast one at a time, which is what the switches above are about."""
     rebuild_fraction: float = 0.25
     """Rebuild the receiver BVH once this fraction of its receivers is in umbra since it was built."""
 
@@ -98,6 +101,7 @@ class CastOptions:
             )
         _at_least("tile_receivers", self.tile_receivers, 1)
         _at_least("leaf_receivers", self.leaf_receivers, 1)
+        _at_least("joint_triangles", self.joint_triangles, 0)
         if not (math.isfinite(self.rebuild_fraction) and self.rebuild_fraction > 0):
             raise SceneError(
                 f"rebuild_fraction is {self.rebuild_fraction}: it must be above 0 (1 or more: never rebuild)"

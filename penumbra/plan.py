@@ -24,7 +24,9 @@ _PREVIEW_BYTES = 24  # a pixel while the picture is exposed
 _CELL_BYTES = 64  # a cell of the grid of receivers
 _BOUND_BYTES = 64  # a blocker of a chunk while its cells are found, on either side of the light
 _ENCODE_BYTES = 24 << 20  # buffers of the EXR encoder
-_STORE_BYTES = 48 << 20  # two chunks of 64 Ki blockers with boxes and reading buffers, the store's index
+_TREE_BYTES = 6 << 20  # a chunk of 64 Ki blockers in light space
+# Two chunks of 64 Ki blockers with boxes and reading buffers, the store's index, a chunk in light space.
+_STORE_BYTES = (48 << 20) + _TREE_BYTES
 _READ_TRIANGLE_BYTES = 260  # a blocker while it is read and sorted in memory
 _KEPT_TRIANGLE_BYTES = 112  # a blocker in memory after that
 _KERNEL_BYTES = 96 << 20  # machine code and LLVM's own memory once every kernel is loaded
@@ -243,7 +245,9 @@ def _place_blockers(
     if geometry.is_store:
         return "store", 0, _STORE_BYTES
     read_bytes = geometry.n_triangles * _READ_TRIANGLE_BYTES
-    kept_bytes = geometry.n_triangles * _KEPT_TRIANGLE_BYTES
+    kept_bytes = geometry.n_triangles * _KEPT_TRIANGLE_BYTES + min(
+        _TREE_BYTES, geometry.n_triangles * _KEPT_TRIANGLE_BYTES
+    )
     # Half of what is free at most: the other half makes the passes few.
     if read_bytes <= free and kept_bytes <= min(free // 2, free - least_pass_bytes):
         return "memory", read_bytes, kept_bytes

@@ -78,7 +78,7 @@ class ReceiverTile:
         n_groups = len(self._light.full_groups)
         if len(order):
             boxes, first, count, child, self.depth = _build(self._points, order, self._leaf_receivers)
-            self.shaft = _shaft(boxes[0], self._light, self._blocker_extent)
+            self.shaft = shaft_to_light(boxes[0], self._light, self._blocker_extent)
         else:
             boxes, first, count, child, self.depth = np.zeros((0, 6)), *np.zeros((3, 0), np.int32), 0
         self.bvh = ReceiverBvh(
@@ -179,7 +179,8 @@ def _build(
     )
 
 
-def _shaft(tile_box: Float64Array, light: LightSamples, blocker_extent: float) -> Shaft:
+def shaft_to_light(tile_box: Float64Array, light: LightSamples, blocker_extent: float) -> Shaft:
+    """Shaft from a box of receivers (6,) to the light; blocker_extent: largest coordinate of a blocker."""
     corners = light.corners[0]
     margin = 4.0 * light.residual
     light_box = np.concatenate([corners.min(axis=0) - margin, corners.max(axis=0) + margin])

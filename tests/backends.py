@@ -1,5 +1,6 @@
 """The backends under test, named once, and how a test compares one with the exact judge."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,15 +9,25 @@ from numpy.typing import NDArray
 from scenes import SmallScene
 
 import penumbra
+from penumbra import CastOptions
 from penumbra.api import CastResult
 
 # A new backend joins every test of bits by adding its name here.
-BACKENDS = ["reference", "hpc", "gears"]
+ONE_AT_A_TIME = "hpc, one blocker at a time"
+BACKENDS = ["reference", "hpc", ONE_AT_A_TIME, "gears"]
 
 Masks = NDArray[np.uint64]
 
 # What the judge said of a scene serves every backend: its decisions are counted and few.
 _decided: dict[tuple[bytes, ...], Masks] = {}
+
+
+def way(backend: str, options: CastOptions | None = None) -> dict[str, Any]:
+    """Arguments of `penumbra.cast` for a backend of BACKENDS."""
+    options = options or CastOptions()
+    if backend == ONE_AT_A_TIME:
+        return {"backend": "hpc", "options": replace(options, joint_triangles=1 << 40)}
+    return {"backend": backend, "options": options}
 
 
 def cast_scene(scene: SmallScene, backend: str, blockers: Any = None, **arguments: Any) -> CastResult:
@@ -27,8 +38,7 @@ def cast_scene(scene: SmallScene, backend: str, blockers: Any = None, **argument
         scene.light,
         normals=scene.normals,
         own=scene.own,
-        backend=backend,
-        **{"threads": 1} | arguments,
+        **{"threads": 1} | arguments | way(backend, arguments.get("options")),
     )
 
 

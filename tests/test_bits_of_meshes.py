@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from backends import BACKENDS
+from backends import BACKENDS, way
 from paths import scene_file
 from scenes import Floats
 
@@ -59,9 +59,9 @@ def test_random_receivers_of_a_mesh(
     corner, edge_u, edge_v = MESHES[name]
     light = RectLight(corner, edge_u, edge_v, samples=40, sets=2)
     points, own = receivers_near(triangles, rng)
-    from_array = penumbra.cast(points, triangles, light, own=own, backend=backend)
+    from_array = penumbra.cast(points, triangles, light, own=own, **way(backend))
     penumbra.ingest([path], tmp_path / "mesh.h5").close()
-    from_store = penumbra.cast(points, tmp_path / "mesh.h5", light, own=own, backend=backend)
+    from_store = penumbra.cast(points, tmp_path / "mesh.h5", light, own=own, **way(backend))
     assert np.array_equal(from_array.masks, from_store.masks)
     bits = np.unpackbits(from_array.masks.view(np.uint8), axis=1, bitorder="little")[:, :40]
     assert 0.05 < bits.mean() < 0.99

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import oracle
 import pytest
-from backends import BACKENDS
+from backends import BACKENDS, way
 from paths import scene_file
 from scenes import Floats
 
@@ -81,7 +81,7 @@ def test_agrees_with_embree_or_is_right(
         half = N_RECEIVERS.get(backend, MANY_RECEIVERS) // 2
         hidden = receivers_behind_vertices(triangles, light, half)
         points = np.concatenate([receivers_above(triangles, half), hidden])
-        result = penumbra.cast(points, store, light, backend=backend)
+        result = penumbra.cast(points, store, light, **way(backend))
     bits = np.unpackbits(result.masks.view(np.uint8), axis=1, bitorder="little")[:, :SAMPLES].astype(bool)
     samples = light.sample_points[result.sample_set]
     in_front = points[:, 1] < min(corner[1], corner[1] + edge_v[1])  # no more is blocked by facing away

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from backends import BACKENDS, way
 
 import penumbra
 
@@ -19,17 +20,15 @@ with np.errstate(all="ignore"):  # words of masks wrap around, and unused lanes 
 
 
 def cast_both() -> np.ndarray:
-    """Masks of a small scene by both backends, uint64 (2, R, n_words); small leaves, tiles and pools."""
+    """Masks of a small scene by every way to cast it, uint64 (3, R, n_words); all parts small."""
     rng = np.random.default_rng(7)
     blockers = rng.uniform(-1, 1, (60, 1, 3)) + rng.normal(size=(60, 3, 3)) * 0.4
     points, normals = rng.uniform(-2, 2, (40, 3)), rng.normal(size=(40, 3))
     light = penumbra.RectLight([-1, 3, -1], [2, 0.3, 0], [0, 0.2, 2], samples=70, sets=3)
     options = penumbra.CastOptions(tile_receivers=30, leaf_receivers=4, rebuild_fraction=0.1)
     masks = []
-    for backend in ("reference", "hpc"):
-        result = penumbra.cast(
-            points, blockers, light, normals=normals, backend=backend, options=options, threads=1
-        )
+    for backend in BACKENDS:
+        result = penumbra.cast(points, blockers, light, normals=normals, threads=1, **way(backend, options))
         masks.append(result.masks)
     return np.array(masks)
 
@@ -40,6 +39,6 @@ def test_kernels_give_the_same_bits_without_jit(tmp_path: Path) -> None:
     output = tmp_path / "masks.npy"
     subprocess.run([sys.executable, "-c", CHILD, str(output)], env=environment, check=True, timeout=300)
     plain = np.load(output)
-    assert np.array_equal(plain[0], plain[1])
+    assert np.array_equal(plain[0], plain[1]) and np.array_equal(plain[0], plain[2])
     assert np.array_equal(plain, cast_both())
     assert plain.any() and not (plain[0] == plain[0, 0]).all()

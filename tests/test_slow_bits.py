@@ -36,6 +36,7 @@ def random_options(rng: np.random.Generator) -> CastOptions:
         tile_receivers=int(rng.choice([1, 3, 100])),
         leaf_receivers=int(rng.choice([1, 2, 16])),
         rebuild_fraction=float(rng.choice([1e-6, 0.25])),
+        joint_triangles=int(rng.choice([0, 1 << 40])),
     )
 
 

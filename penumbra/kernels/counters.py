@@ -20,6 +20,14 @@ NAMES = (
     "pairs_covering",  # of those, pairs whose blocker was seen to block all samples at once (gears)
     "masks_allocated",  # masks taken from the pool
     "masks_released",  # masks given back because all is blocked
+    "leaves_visited",  # leaf of receivers x chunk x block of samples that the joint descent entered
+    "tree_nodes_visited",  # leaf of receivers x node of a chunk's hierarchy
+    "clusters_visited",  # leaf of receivers x cluster of 16 blockers
+    "cluster_tests",  # receiver x cluster pairs whose samples were looked up
+    "cluster_pairs",  # receiver x cluster pairs set up
+    "triangle_major",  # of those, tested one blocker against 16 samples at a time
+    "pairs_escalated",  # receiver x blocker pairs decided in world space
+    "lanes_tested",  # receiver x blocker x sample lanes of the joint descent
 )
 (
     BLOCKERS_TESTED,
@@ -41,5 +49,13 @@ NAMES = (
     PAIRS_COVERING,
     MASKS_ALLOCATED,
     MASKS_RELEASED,
+    LEAVES_VISITED,
+    TREE_NODES_VISITED,
+    CLUSTERS_VISITED,
+    CLUSTER_TESTS,
+    CLUSTER_PAIRS,
+    TRIANGLE_MAJOR,
+    PAIRS_ESCALATED,
+    LANES_TESTED,
 ) = range(len(NAMES))
 N_COUNTERS = len(NAMES)

@@ -3,6 +3,10 @@
 import numpy as np
 
 from penumbra.kernels._jit import helper, kernel
+from penumbra.kernels.bits import lowest_bit
+from penumbra.kernels.borrow import borrow
+from penumbra.kernels.hard_shadow import LANE_BOUND
+from penumbra.kernels.lanes import bits_above, load, splat
 from penumbra.kernels.predicates import (
     OVERFLOW,
     UNDERFLOW,
@@ -11,6 +15,8 @@ from penumbra.kernels.predicates import (
     edges_side_sign,
 )
 
+_SMALLEST = 1e-250
+_LARGEST = 1e250
 FACES_ALL = np.uint8(0)
 FACES_SOME = np.uint8(1)
 FACES_NONE = np.uint8(2)
@@ -59,16 +65,51 @@ def classify_facing(points, normals, light, single_sided, out):
             out[r] = _normal_faces(px, py, pz, normals[r, 0], normals[r, 1], normals[r, 2], light)
 
 
+@helper
+def _facing_function(px, py, pz, nx, ny, nz, light):
+    """n . (l - r) over the light as float32 A + B s + C t, scaled to at most 1, and the bound of its lanes."""
+    o, u, v = light.origin, light.edge_u, light.edge_v
+    gx, gy, gz = o[0] - px, o[1] - py, o[2] - pz
+    a = nx * gx + ny * gy + nz * gz
+    b = nx * u[0] + ny * u[1] + nz * u[2]
+    c = nx * v[0] + ny * v[1] + nz * v[2]
+    reach = abs(gx) + abs(gy) + abs(gz)
+    for axis in range(3):
+        reach += abs(u[axis]) + abs(v[axis])
+    norm = abs(nx) + abs(ny) + abs(nz)
+    error = norm * (16.0 * UNIT_ROUNDOFF * reach + light.residual) + UNDERFLOW * (1.0 + norm + reach)
+    total = abs(a) + abs(b) + abs(c)
+    if not (total > _SMALLEST and total < _LARGEST and error < _LARGEST):
+        # Nothing is known: every lane is left open.
+        zero = np.float32(0.0)
+        return zero, zero, zero, np.float32(np.inf)
+    scale = 1.0 / max(max(abs(a), abs(b)), abs(c))
+    bound = LANE_BOUND + np.float32(1.001 * error * scale)
+    return np.float32(a * scale), np.float32(b * scale), np.float32(c * scale), bound
+
+
 @kernel
 def fill_not_facing(rows, points, normals, sample_sets, light, n_samples, masks):
     """Set in masks (n_rows, n_words) the bits of the samples with n . (l - r) <= 0, for given rows."""
+    light = borrow(light)
+    n_padded = light.parameters.shape[2]
     for k in range(rows.shape[0]):
         r = rows[k]
-        for sample in range(n_samples):
-            point = light.points[sample_sets[r], sample]
-            side = dot_difference_sign(
-                normals[r, 0], normals[r, 1], normals[r, 2],
-                point[0], point[1], point[2], points[r, 0], points[r, 1], points[r, 2],
-            )  # fmt: skip
-            if side <= 0:
-                masks[k, sample >> 6] |= np.uint64(1) << np.uint64(sample & 63)
+        x, y, z = points[r, 0], points[r, 1], points[r, 2]
+        nx, ny, nz = normals[r, 0], normals[r, 1], normals[r, 2]
+        a, b, c, bound = _facing_function(x, y, z, nx, ny, nz, light)
+        sample_set = np.int64(sample_sets[r])
+        first = sample_set * 2 * n_padded
+        for start in range(0, n_samples, 16):
+            s, t = load(light.parameters, first + start), load(light.parameters, first + n_padded + start)
+            f = splat(a) + splat(b) * s + splat(c) * t
+            exists = (np.int64(1) << min(np.int64(16), n_samples - start)) - 1
+            not_faced = bits_above(splat(-bound), f) & exists
+            left_open = exists & ~not_faced & ~bits_above(f, splat(bound))
+            while left_open != 0:
+                lane = lowest_bit(np.uint64(left_open))
+                left_open &= left_open - 1
+                p = light.points[sample_set, start + lane]
+                if dot_difference_sign(nx, ny, nz, p[0], p[1], p[2], x, y, z) <= 0:
+                    not_faced |= np.int64(1) << lane
+            masks[k, start >> 6] |= np.uint64(not_faced) << np.uint64(start & 63)
