@@ -241,7 +241,7 @@ class ReceiverLeaves(NamedTuple):
     centres: Float32Array  # (N, 6) centre as a float32, and what that leaves out
     reaches: Float32Array  # (N, 2) largest offset, largest distance from a sample (sums of absolute values)
     boxes: Float32Array  # (N, 6) min and max of `places`
-    count: Int32Array  # (N,) receivers; lanes beyond are copies of the last
+    count: Int32Array  # type: ignore[assignment]  # (N,) receivers; lanes beyond are copies of the last
     is_done: UInt8Array  # (N,) nothing is left to block
     row: Int64Array  # (16 N,) row of the receiver in points, masks, ...
     points: Float64Array  # (R, 3) world space, by row

@@ -241,4 +241,5 @@ def _count(
     stats.count("tiles", len(tiles) + sum(len(side.slices) for side in sides))
     stats.count("rebuilds", sum(tile.n_rebuilds for tile in tiles))
     stats.count("mask_bytes", sum(tile.pool.masks.nbytes for tile in tiles))
-    stats.count("hierarchy_bytes", sum(part.hierarchy_bytes for part in [*sides, *tiles]))
+    stats.count("hierarchy_bytes", sum(tile.hierarchy_bytes for tile in tiles))
+    stats.count("hierarchy_bytes", sum(side.hierarchy_bytes for side in sides))

@@ -22,6 +22,7 @@ def warm_up(progress: Progress | None = None) -> Path:
     Later commands load the machine code in a fraction of a second. A changed kernel or another numba
     uses another folder and compiles again.
     """
+    from penumbra.api import cast
     from penumbra.ingest import ingest
     from penumbra.kernels._jit import cache_folder
     from penumbra.render import render
@@ -35,6 +36,9 @@ def warm_up(progress: Progress | None = None) -> Path:
         ingest([folder / "a.obj", folder / "b.ply"], folder / "scene.h5").close()
         for backend in ("hpc", "gears", "reference"):
             render(_scene(folder / "scene.h5"), folder / f"{backend}.exr", backend=backend)
+        # Lights without a light space, such as those of zero area, are cast one blocker at a time.
+        point = RectLight([0, 2, 0], [0, 0, 0], [0, 0, 0], samples=1)
+        cast(np.zeros((1, 3)), folder / "scene.h5", point)
     progress.close()
     return cache_folder()
 

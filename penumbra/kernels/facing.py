@@ -67,7 +67,7 @@ def classify_facing(points, normals, light, single_sided, out):
 
 @helper
 def _facing_function(px, py, pz, nx, ny, nz, light):
-    """n . (l - r) over the light as float32 A + B s + C t, scaled to at most 1, and the bound of its lanes."""
+    """Return n . (l - r) over the light as float32 A + B s + C t, at most 1, and the bound of its lanes."""
     o, u, v = light.origin, light.edge_u, light.edge_v
     gx, gy, gz = o[0] - px, o[1] - py, o[2] - pz
     a = nx * gx + ny * gy + nz * gz
