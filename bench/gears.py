@@ -22,7 +22,7 @@ from penumbra.api import CastResult
 from penumbra.ingest import blockers_in_memory
 from penumbra.options import CastOptions
 
-STEPS = ("project", "bound", "count", "prefix_sum", "fill", "rasterise")
+STEPS = ("bound", "count", "prefix_sum", "fill", "rasterise", "bin")
 GRIDS = (32, 64, 128, 256)
 
 
@@ -59,9 +59,10 @@ def table(title: str, header: tuple[str, ...], rows: list[list[str]]) -> None:
 
 
 def steps_row(label: str, result: CastResult, seconds: float) -> list[str]:
-    """Seconds by step, and all."""
-    taken = result.stats.seconds
-    return [label, *(f"{taken[step]:.2f}" for step in STEPS), f"{sum(taken.values()):.2f}", f"{seconds:.2f}"]
+    """Seconds of both stages and of the steps of casting (0 for what was never done), and processor time."""
+    stages, steps = result.stats.seconds, result.stats.step_seconds
+    taken = (stages["hierarchy"], *(steps.get(f"cast_{step}", 0.0) for step in STEPS), stages["cast"])
+    return [label, *(f"{part:.2f}" for part in taken), f"{seconds:.2f}"]
 
 
 def cells_row(label: str, result: CastResult) -> list[str]:
@@ -90,7 +91,7 @@ def report(name: str, case: Case, samples: int) -> list[str]:
     size = "x".join(map(str, case.scene.camera.resolution))
     print(f"\n### {name}, {size}, K = {samples}, {len(case.points):,} receivers")
     rows = [steps_row(f"{n}", *run) for n, run in runs.items()] + [steps_row("128, regular", *regular)]
-    table("Seconds by step", ("grid", *STEPS, "all", "processor"), rows)
+    table("Seconds by step", ("grid", "hierarchy", *STEPS, "cast", "processor"), rows)
     # Without leaving out what is blocked already, as the paper counts.
     whole = {"umbra_bits": False}
     rows = [

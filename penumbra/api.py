@@ -8,14 +8,14 @@ from typing import Any, Literal
 import numpy as np
 
 from penumbra.arrays import Float32Array, Float64Array, Int64Array, Receivers, UInt8Array, UInt64Array
-from penumbra.blockers import Blockers
+from penumbra.blockers import Blockers, MemoryBlockers
 from penumbra.errors import BackendError, SceneError
 from penumbra.executors.threads import resolve_threads
 from penumbra.lights import Light, PointLight, RectLight
-from penumbra.memory import call_limit_bytes
+from penumbra.memory import call_limit_bytes, give_back
 from penumbra.options import CastOptions, IngestOptions, parse_size
 from penumbra.plan import array_bytes, backend_bytes, fitted_options, receivers_per_pass
-from penumbra.progress import NullProgress, Progress
+from penumbra.progress import NullProgress, Progress, RepeatedStage
 from penumbra.scene import Scene
 from penumbra.stats import Stats
 
@@ -90,7 +90,7 @@ def cast(
             backend,
             options=options,
             threads=resolve_threads(threads),
-            progress=progress or NullProgress(),
+            progress=RepeatedStage(progress or NullProgress(), -(-len(receivers.points) // per_pass)),
         )
 
 
@@ -149,6 +149,8 @@ def _cast_in_passes(
     visibility = np.ones(n_receivers, np.float32)
     stats = Stats("hpc" if backend == "auto" else backend)
     for first in range(0, n_receivers, per_pass):
+        # What the pass before has freed would stand beside what this one takes.
+        give_back()
         rows = slice(first, first + per_pass)
         normals = receivers.normals[rows] if len(receivers.normals) else receivers.normals
         part = Receivers(receivers.points[rows], normals, receivers.own[rows], receivers.index[rows])
@@ -156,6 +158,8 @@ def _cast_in_passes(
         visibility[rows] = visible_fraction(found, light.samples)
         if masks is not None:
             masks[rows] = found
+        # The masks of one pass must not be there while the next is cast.
+        del found
         stats.merge(part_stats)
     return CastResult(masks, sample_set, visibility, stats)
 
@@ -175,11 +179,12 @@ def _checked_blockers(blockers: Any) -> Blockers | Float64Array:
 
 
 def _blocker_bytes(blockers: Blockers | Float64Array) -> int:
-    """Memory that the blockers take in this call: an array is sorted, of a store two chunks are held."""
+    """Memory that the blockers add in this call: an array is sorted, of a store two chunks are held."""
     if isinstance(blockers, np.ndarray):
         return array_bytes(len(blockers))
-    # Two chunks at a time, each as it is read and as float64, and one in light space.
-    return 5 * max((chunk.n_bytes for chunk in blockers.chunks), default=0)
+    largest = max((chunk.n_bytes for chunk in blockers.chunks), default=0)
+    # In light space one chunk at a time; of a store, two are held, each as it is read and as float64.
+    return largest if isinstance(blockers, MemoryBlockers) else 5 * largest
 
 
 def _chunk_triangles(blockers: Blockers | Float64Array) -> int:

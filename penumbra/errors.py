@@ -42,6 +42,11 @@ class MemoryLimitError(PenumbraError, MemoryError):
 
     exit_code = 3
 
+    def __init__(self, message: str, enough_bytes: int | None = None) -> None:
+        """`enough_bytes`: the limit that would do, where it is known."""
+        super().__init__(message)
+        self.enough_bytes = enough_bytes
+
 
 class Interrupted(PenumbraError):
     """A signal stopped the run; `exit_code` says which (75: SIGTERM, 130: Ctrl-C)."""

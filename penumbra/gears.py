@@ -1,6 +1,7 @@
 """6: backend "gears", blockers assigned to the cells of a grid of receivers (Wang et al. 2014)."""
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
 import numpy as np
 
@@ -50,7 +51,7 @@ def cast_receivers(
     there, counted, and sorted by cell, and each receiver rasterises the blockers of its cell onto its mask.
     """
     stats = Stats("gears")
-    with stats.timed("project"):
+    with stats.timed("hierarchy"):
         start = face_light(receivers, light, options.group_size)
         grids = make_grids(
             receivers.points,
@@ -64,10 +65,11 @@ def cast_receivers(
         )
     casts = [_GridCast(grid, receivers, start, options, threads, stats) for grid in grids]
     progress.stage("cast", blockers.n_triangles, "triangles")
-    for chunk in _chunks(blockers, grids, options, progress, stats):
-        for cast in casts:
-            cast.cast(chunk)
-        progress.advance(len(chunk.ids))
+    with stats.timed("cast"):
+        for chunk in _chunks(blockers, grids, options, progress, stats):
+            for cast in casts:
+                cast.cast(chunk)
+            progress.advance(len(chunk.ids))
     for cast in casts:
         cast.report()
     stats.count("receivers_not_cast", len(receivers.points) - len(start.live))
@@ -126,17 +128,17 @@ class _GridCast:
 
     def cast(self, chunk: BlockerChunk) -> None:
         """Assign a chunk's blockers to cells, in batches whose pairs fit the memory, and rasterise them."""
-        with self._stats.timed("bound"):
+        with self._step("bound"):
             rects, nearest, counts = self._bound(chunk)
         for batch in _batches(counts, self._options.pair_bytes // _PAIR_BYTES):
             begin, pairs = self._sort_by_cell(batch, rects, nearest)
-            with self._stats.timed("rasterise"):
+            with self._step("rasterise"):
                 self._rasterise(chunk, begin, pairs)
             self._stats.count("batches", 1)
             self._stats.count("cell_pairs", len(pairs))
         self._stats.count("blockers_assigned", int(np.count_nonzero(counts)))
         if self._options.umbra_bits and self._n_full > self._options.rebuild_fraction * self._n_live:
-            with self._stats.timed("project"):
+            with self._step("bin"):
                 self._leave_out_blocked()
 
     def _bound(self, chunk: BlockerChunk) -> tuple[Int32Array, Float64Array, Int64Array]:
@@ -162,7 +164,8 @@ class _GridCast:
         paper fills them in by blocker and sorts them then.
         """
         grid, error = self._grid.grid, self._grid.camera.error
-        edges = np.linspace(batch.start, batch.stop, self._threads + 1).astype(np.int64)
+        n_parts = min(self._threads, -(-(batch.stop - batch.start) // _BLOCKER_SLICE))
+        edges = np.linspace(batch.start, batch.stop, n_parts + 1).astype(np.int64)
         parts = list(zip(edges, edges[1:], strict=False))
         place = np.zeros((len(parts), len(grid.far) + 1), np.int64)
 
@@ -172,15 +175,15 @@ class _GridCast:
         def fill(k: int) -> None:
             fill_cells(*parts[k], rects, nearest, grid, error, place[k], pairs)
 
-        with self._stats.timed("count"):
+        with self._step("count"):
             run_tasks(count, range(len(parts)), self._threads)
-        with self._stats.timed("prefix_sum"):
+        with self._step("prefix_sum"):
             in_cell = place.sum(axis=0)
             begin = np.concatenate([[0], np.cumsum(in_cell)])
             # Of one cell, the parts' runs follow each other.
             place[:] = begin[:-1] + np.cumsum(place, axis=0) - place
             self._blockers_in_cell += in_cell
-        with self._stats.timed("fill"):
+        with self._step("fill"):
             pairs = np.empty(begin[-1], np.int32)
             run_tasks(fill, range(len(parts)), self._threads)
         return begin, pairs
@@ -201,6 +204,9 @@ class _GridCast:
         self._n_full += sum(run_tasks(task, range(len(slices)), self._threads))
         self._counters += counters.sum(axis=0)
 
+    def _step(self, name: str) -> AbstractContextManager[None]:
+        return self._stats.timed_step("cast", name)
+
     @property
     def _n_live(self) -> int:
         """Receivers in the grid."""
@@ -217,8 +223,8 @@ class _GridCast:
         for name, amount in zip(NAMES, self._counters, strict=True):
             self._stats.count(name, int(amount))
         used = self._receivers_in_cell > 0
-        self._stats.count("cells", len(used) - 1)
-        self._stats.count("cells_used", int(used[:-1].sum()))
+        self._stats.count_most("cells", len(used) - 1)
+        self._stats.count_most("cells_used", int(used[:-1].sum()))
         self._stats.count_most("most_blockers_in_cell", int(self._blockers_in_cell.max()))
         self._stats.count_most("most_receivers_in_cell", int(self._receivers_in_cell.max()))
         self._stats.count("receivers_outside_grid", int(self._receivers_in_cell[-1]))

@@ -52,8 +52,8 @@ class RectLight:
         corner, edge_u, edge_v: three numbers each, world space. `samples` (K) points per set, one in
         each of K strata of equal area; `sets` distinct sample sets against banding (HPC section 3.4);
         `radiance` in W m^-2 sr^-1. `pattern`: "jittered", a random point of every stratum, or "regular",
-        its centre (all sets are then equal). Raises SceneError for numbers that are not finite or out of
-        range, and for other patterns.
+        its centre; all sets would then be equal, so `sets` is kept as 1. Raises SceneError for numbers that
+        are not finite or out of range, and for other patterns.
         """
         keep = partial(object.__setattr__, self)
         keep("name", str(name))
@@ -75,6 +75,8 @@ class RectLight:
         if pattern not in PATTERNS:
             raise SceneError(f"pattern of light '{name}' is {pattern!r}: give 'jittered' or 'regular'")
         keep("pattern", pattern)
+        if pattern == "regular":
+            keep("sets", 1)
 
     def settings(self) -> dict[str, Any]:
         """Everything that makes this light, by the keys of a scene file; JSON values."""

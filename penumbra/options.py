@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Literal
 
 from penumbra.errors import SceneError
@@ -87,6 +88,7 @@ class CastOptions:
     """gears: memory for the blockers of all cells, which decides how many blockers are taken at a time."""
 
     def __post_init__(self) -> None:
+        _at_least("group_size", self.group_size, 32)
         if self.group_size not in (32, 64):
             raise SceneError(f"group_size is {self.group_size}: a light sample group has 32 or 64 samples")
         _at_least("grid_resolution", self.grid_resolution, 1)
@@ -95,19 +97,24 @@ class CastOptions:
             raise SceneError(f"grid_resolution is {self.grid_resolution}: it may be {_MOST_CELLS} at most")
         if self.grid_spacing not in ("quantile", "regular"):
             raise SceneError(f"grid_spacing is {self.grid_spacing!r}: give 'quantile' or 'regular'")
-        if not (math.isfinite(self.grid_eye) and self.grid_eye >= 0):
+        if not (_is_finite(self.grid_eye) and self.grid_eye >= 0):
             raise SceneError(
-                f"grid_eye is {self.grid_eye}: it must be a number of light diagonals, 0 or more"
+                f"grid_eye is {self.grid_eye!r}: it must be a number of light diagonals, 0 or more"
             )
         _at_least("tile_receivers", self.tile_receivers, 1)
         _at_least("leaf_receivers", self.leaf_receivers, 1)
         _at_least("joint_triangles", self.joint_triangles, 0)
-        if not (math.isfinite(self.rebuild_fraction) and self.rebuild_fraction > 0):
+        if not (_is_finite(self.rebuild_fraction) and self.rebuild_fraction > 0):
             raise SceneError(
-                f"rebuild_fraction is {self.rebuild_fraction}: it must be above 0 (1 or more: never rebuild)"
+                f"rebuild_fraction is {self.rebuild_fraction!r}: it must be a number above 0 "
+                "(1 or more: never rebuild)"
             )
 
 
 def _at_least(name: str, value: int, least: int) -> None:
-    if value < least:
-        raise SceneError(f"{name} is {value}: it must be at least {least}")
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise SceneError(f"{name} is {value!r}: it must be a whole number, at least {least}")
+
+
+def _is_finite(value: float) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)

@@ -21,7 +21,7 @@ _RESULT_BYTES = 5  # a receiver in the result, without its mask
 _MASK_WORD_BYTES = 16  # 64 light samples of a receiver: in the result, and at worst in its tile's pool too
 _SAMPLE_BYTES = 64  # a light sample of one set, as point and as lane
 _PREVIEW_BYTES = 24  # a pixel while the picture is exposed
-_CELL_BYTES = 64  # a cell of the grid of receivers
+_CELL_BYTES = 512  # a cell of the grid: twice (both sides of a light), in up to eight parts of a chunk
 _BOUND_BYTES = 64  # a blocker of a chunk while its cells are found, on either side of the light
 _ENCODE_BYTES = 24 << 20  # buffers of the EXR encoder
 _TREE_BYTES = 6 << 20  # a chunk of 64 Ki blockers in light space
@@ -34,6 +34,7 @@ _INGEST_LEAST_BYTES = 96 << 20
 _SCRATCH_TRIANGLE_BYTES = 2 * 84  # the store and, while it is made, its unsorted buckets
 
 _ROUND_BYTES = 16 << 20
+_LEAST_PASS = 1024  # receivers of one `cast`: fewer would read the blockers too often
 
 
 class LightPlan(NamedTuple):
@@ -47,7 +48,9 @@ class LightPlan(NamedTuple):
     def __str__(self) -> str:
         """Return what of the light is cast."""
         return f"{self.name}: " + (
-            "a point" if self.is_point else f"{self.samples} samples in {self.sets} sets"
+            "a point"
+            if self.is_point
+            else f"{self.samples} samples in {self.sets} set{'s' if self.sets > 1 else ''}"
         )
 
 
@@ -70,6 +73,7 @@ class RenderPlan:
     source: BlockerSource
     passes: tuple[Window, ...]
     threads: int
+    backend: str
     limit_bytes: int
     resident_bytes: int
     kernel_bytes: int
@@ -127,6 +131,7 @@ class RenderPlan:
         lines = [
             ("picture", f"{width} x {height}, window {x0} {y0} {x1} {y1}: {(x1 - x0) * (y1 - y0):,} pixels"),
             *(("light", str(light)) for light in self.lights),
+            ("backend", self.backend),
             ("blockers", f"{about}{self.geometry.n_triangles:,} triangles from {self.source}"),
             ("", f"read {n_reads} times at most: to see, and for each light, in each pass"),
             ("passes", f"{len(self.passes)} of up to {rows} rows, on {self.threads} threads"),
@@ -148,6 +153,7 @@ def make_plan(
     resident_bytes: int,
     threads: int,
     process_limit: bool = True,
+    backend: str = "hpc",
     engine_bytes: int = 0,
 ) -> RenderPlan:
     """Choose where the blockers live and how many passes there are.
@@ -167,8 +173,10 @@ def make_plan(
     least = max(ingest_bytes, blocker_bytes + light_bytes + row_bytes, write_bytes)
     if free < least:
         before = 0 if process_limit else resident_bytes
-        enough = limit_bytes - free + least - before
-        raise MemoryLimitError(_refusal(resolution, window, n_words, limit_bytes - before, enough))
+        enough = enough_limit(limit_bytes - free + least - before)
+        samples = max(light.samples for light in lights)
+        refusal = _refusal(resolution, window, samples, limit_bytes - before, enough)
+        raise MemoryLimitError(refusal, enough)
     passes = _bands(window, (free - blocker_bytes - light_bytes) // row_bytes)
     return RenderPlan(
         resolution=resolution,
@@ -178,6 +186,7 @@ def make_plan(
         source=source,
         passes=passes,
         threads=threads,
+        backend=backend,
         limit_bytes=limit_bytes,
         resident_bytes=resident_bytes,
         kernel_bytes=_KERNEL_BYTES,
@@ -194,8 +203,10 @@ def backend_bytes(backend: str, options: CastOptions, chunk_triangles: int) -> i
     """Memory that a backend takes beside receivers and light: lists of the cells, bounds of a chunk."""
     if backend != "gears":
         return 0
-    grid_bytes = options.grid_resolution**2 * _CELL_BYTES
-    return options.pair_bytes + grid_bytes + chunk_triangles * _BOUND_BYTES
+    n_cells = options.grid_resolution**2
+    # One blocker may touch every cell.
+    pair_bytes = max(options.pair_bytes, 4 * n_cells)
+    return pair_bytes + n_cells * _CELL_BYTES + chunk_triangles * _BOUND_BYTES
 
 
 def fitted_options(options: CastOptions, limit_bytes: int) -> CastOptions:
@@ -213,19 +224,36 @@ def receivers_per_pass(
 ) -> int:
     """How many of the receivers of one `cast` are cast at a time, beside blockers, light and result.
 
-    Raises MemoryLimitError when fewer than 1024 of them, or than all, would fit.
+    Raises MemoryLimitError when fewer than `_LEAST_PASS` of them, or than all, would fit.
     """
-    n_words = -(-n_samples // 64)
-    held = n_samples * sets * _SAMPLE_BYTES + blocker_bytes
-    held += n_receivers * (_RESULT_BYTES + (8 * n_words if keep_masks else 0))
-    receiver_bytes = _RECEIVER_BYTES + _CAST_BYTES + n_words * _MASK_WORD_BYTES
-    least = held + min(n_receivers, 1024) * receiver_bytes
+    held, receiver_bytes = _call_bytes(n_receivers, n_samples, sets, keep_masks)
+    held += blocker_bytes
+    least = held + min(n_receivers, _LEAST_PASS) * receiver_bytes
     if least > limit_bytes:
         raise MemoryLimitError(
             f"casting {n_receivers} points needs {format_bytes(least)} and the limit is"
             f" {format_bytes(limit_bytes)}: raise memory, cast fewer points at a time, or name a store"
         )
     return max(1, min(n_receivers, (limit_bytes - held) // receiver_bytes))
+
+
+def least_cast_bytes(
+    n_receivers: int, n_samples: int, sets: int, blocker_bytes: int, chunk_triangles: int, backend: str
+) -> int:
+    """A limit that is enough for one `cast` that keeps no masks, by a backend with its default options."""
+    held, receiver_bytes = _call_bytes(n_receivers, n_samples, sets, keep_masks=False)
+    # Without grid and lists of cells, which then take an eighth each of what is given (`fitted_options`).
+    fixed = backend_bytes(backend, fitted_options(CastOptions(), 0), chunk_triangles)
+    least = held + blocker_bytes + fixed + min(n_receivers, _LEAST_PASS) * receiver_bytes
+    return least if backend != "gears" else -(-4 * least // 3)
+
+
+def _call_bytes(n_receivers: int, n_samples: int, sets: int, keep_masks: bool) -> tuple[int, int]:
+    """What one `cast` holds for light and result, and what it adds for a receiver of a pass."""
+    n_words = -(-n_samples // 64)
+    result_bytes = _RESULT_BYTES + (8 * n_words if keep_masks else 0)
+    held = n_samples * sets * _SAMPLE_BYTES + n_receivers * result_bytes
+    return held, _RECEIVER_BYTES + _CAST_BYTES + n_words * _MASK_WORD_BYTES
 
 
 def array_bytes(n_triangles: int) -> int:
@@ -262,12 +290,16 @@ def _bands(window: Window, rows: int) -> tuple[Window, ...]:
     return tuple((x0, first, x1, last) for first, last in zip(edges, edges[1:], strict=False))
 
 
-def _refusal(resolution: tuple[int, int], window: Window, n_words: int, limit: int, least: int) -> str:
-    width, height = resolution
-    # Rounded up with some slack: what is resident before the render differs from run to run.
-    enough = (least + least // 50 + _ROUND_BYTES) // _ROUND_BYTES * _ROUND_BYTES
+def enough_limit(least_bytes: int) -> int:
+    """A limit to advise, rounded up with some slack: what is resident before differs from run to run."""
+    return (least_bytes + least_bytes // 50 + _ROUND_BYTES) // _ROUND_BYTES * _ROUND_BYTES
+
+
+def _refusal(resolution: tuple[int, int], window: Window, samples: int, limit: int, enough: int) -> str:
+    width, height = window[2] - window[0], window[3] - window[1]
+    part = "" if (width, height) == tuple(resolution) else f" (of {resolution[0]} x {resolution[1]})"
     return (
-        f"a picture of {window[2] - window[0]} x {window[3] - window[1]} pixels (of {width} x {height}) "
-        f"with up to {64 * n_words} light samples does not fit the memory limit of {format_bytes(limit)}: "
+        f"a picture of {width} x {height} pixels{part} with {samples} light "
+        f"sample{'s' if samples > 1 else ''} does not fit the memory limit of {format_bytes(limit)}: "
         f"give {enough >> 20}MiB or more, or render fewer pixels (--resolution, --crop)"
     )

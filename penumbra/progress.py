@@ -45,6 +45,29 @@ class NullProgress:
         return
 
 
+class RepeatedStage:
+    """Work that is done `n_times` over, shown as one stage of so many times the amount."""
+
+    def __init__(self, progress: Progress, n_times: int) -> None:
+        self._progress = progress
+        self._n_times = n_times
+        self._begun = False
+
+    def stage(self, name: str, total: float | None, unit: str) -> None:
+        """Begin the stage, the first time."""
+        if not self._begun:
+            self._begun = True
+            self._progress.stage(name, None if total is None else total * self._n_times, unit)
+
+    def advance(self, amount: float) -> None:
+        """Pass on."""
+        self._progress.advance(amount)
+
+    def close(self) -> None:
+        """Pass on."""
+        self._progress.close()
+
+
 class _StreamProgress(ABC):
     """Keeps count of the current stage and writes about it at most every `_interval` seconds."""
 

@@ -30,10 +30,12 @@ def make_grids(
         return []
     # Beyond the largest numbers nothing can be projected: the camera then sees no receiver.
     with np.errstate(over="ignore", invalid="ignore"):
-        seen = points[live] - light.origin
+        seen = points[live] - _middle(light)
         axes = _frame(light, seen.mean(axis=0))
         ahead = seen @ axes[2] >= 0.0
-    extent = float(max(np.abs(points[live]).max(), np.abs(light.corners).max(), blocker_extent))
+    of_light = [light.corners.reshape(-1, 3), light.origin, light.edge_u, light.edge_v]
+    extent = max(float(np.abs(part).max()) for part in [points[live], *of_light])
+    extent = max(extent, blocker_extent)
     sides = (
         [(axes, live[ahead]), (axes * [[1.0], [1.0], [-1.0]], live[~ahead])] if two_sided else [(axes, live)]
     )
@@ -120,10 +122,12 @@ def _camera(
         error = _ROUNDINGS * row_sum * 2.0 * extent + _SUBNORMAL_ROUNDING
         if not extent < 1e100:
             error = np.inf
-        lamp = (light.corners[0] - light.origin) @ axes.T
+        middle = _middle(light)
+        lamp = (light.corners[0] - middle) @ axes.T
         reach = error + 4.0 * row_sum * light.residual
         lamp_low, lamp_high = lamp.min(axis=0), lamp.max(axis=0)
-        seen = (points - light.origin) @ axes.T
+        lamp_box = np.concatenate([lamp_low - reach, lamp_high + reach])
+        seen = (points - middle) @ axes.T
         centre = 0.5 * (np.minimum(seen.min(axis=0), lamp_low) + np.maximum(seen.max(axis=0), lamp_high))
         slope = np.ones(3)
         if centre[2] > 0.0:
@@ -131,11 +135,18 @@ def _camera(
         distance = eye_distance * float(np.linalg.norm(lamp_high - lamp_low)) / float(np.linalg.norm(slope))
     return GridCamera(
         axes=np.ascontiguousarray(axes),
-        origin=np.array(light.origin),
+        origin=middle,
         eye=-slope * distance if np.isfinite(distance) else np.zeros(3),
-        light=np.concatenate([lamp_low - reach, lamp_high + reach]),
+        light=lamp_box,
         error=float(error),
     )
+
+
+def _middle(light: LightSamples) -> Float64Array:
+    """Middle of the samples: of one sample the sample itself, however large the light is."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        middle: Float64Array = light.corners[0].mean(axis=0)
+    return middle
 
 
 def _lines(image: Float64Array, resolution: int, spacing: str) -> Float64Array:

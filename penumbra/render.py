@@ -225,6 +225,7 @@ def _make_plan(
         resident_bytes=resident,
         threads=resolve_threads(threads),
         process_limit=process_limit,
+        backend="hpc (auto)" if backend == "auto" else backend,
         engine_bytes=backend_bytes(backend, CastOptions(), IngestOptions().chunk_triangles),
     )
 

@@ -26,6 +26,9 @@ class Stats:
     backend: str
     counters: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    """By stage; stages do not overlap, so that their sum is the time of all."""
+    step_seconds: dict[str, float] = field(default_factory=dict)
+    """By step, `<stage>_<step>`: parts of `seconds[stage]`, never to be added to it."""
     most: dict[str, int] = field(default_factory=dict)
 
     def count(self, name: str, amount: int) -> None:
@@ -43,7 +46,16 @@ class Stats:
         try:
             yield
         finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - began
+            _add(self.seconds, stage, time.perf_counter() - began)
+
+    @contextmanager
+    def timed_step(self, stage: str, step: str) -> Iterator[None]:
+        """Add the wall time of the body, which is inside of `timed(stage)`, to a step of the stage."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            _add(self.step_seconds, f"{stage}_{step}", time.perf_counter() - began)
 
     def merge(self, other: "Stats") -> None:
         """Add the counters and seconds of another run."""
@@ -52,11 +64,18 @@ class Stats:
         for name, amount in other.most.items():
             self.count_most(name, amount)
         for stage, seconds in other.seconds.items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+            _add(self.seconds, stage, seconds)
+        for step, seconds in other.step_seconds.items():
+            _add(self.step_seconds, step, seconds)
 
     def as_dict(self) -> dict[str, Any]:
-        """One flat dictionary: backend, seconds_<stage>, the counters, peak_bytes of the process."""
+        """One flat dictionary: backend, seconds of stages and steps, counters, peak_bytes of the process."""
         flat: dict[str, Any] = {"backend": self.backend}
-        flat |= {f"seconds_{stage}": round(seconds, 6) for stage, seconds in self.seconds.items()}
+        times = self.seconds | self.step_seconds
+        flat |= {f"seconds_{name}": round(seconds, 6) for name, seconds in times.items()}
         flat |= dict.fromkeys(_ALWAYS, 0) | self.counters | self.most
         return flat | {"peak_bytes": peak_bytes()}
+
+
+def _add(times: dict[str, float], name: str, seconds: float) -> None:
+    times[name] = times.get(name, 0.0) + seconds

@@ -1,4 +1,4 @@
-"""Two engines that share nothing but the definition of a bit, on whole pictures of real scenes."""
+"""Two engines that share how a bit is decided and nothing else, on whole pictures of real scenes."""
 
 import importlib.util
 from pathlib import Path

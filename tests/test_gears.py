@@ -11,10 +11,13 @@ from scenes import LIGHTS, SmallScene, large_scene, light_named, scene_of, trans
 import penumbra
 from penumbra import CastOptions, IngestOptions, PointLight, RectLight
 from penumbra.errors import SceneError
+from penumbra.image import header_attributes
 from penumbra.ingest import blockers_in_memory
 from penumbra.kernels.shadow_grid import bound_volumes, count_cells, fill_cells
-from penumbra.measure.stability_cases import SceneSize, cases_named, hard_scene
+from penumbra.measure.stability_cases import cases_named
+from penumbra.measure.stability_scene import SceneSize, hard_scene
 from penumbra.receiver_grid import ShadowGrid, make_grids
+from penumbra.stats import Stats
 
 OPTIONS = {
     "one cell": CastOptions(grid_resolution=1),
@@ -104,10 +107,8 @@ def test_receivers_in_a_shadow_volume_are_in_its_cells(
         missing = [r for r in np.flatnonzero(cells >= 0) if r not in assigned[cells[r]]]
         # Only where rounding moved a receiver off its segment may it have left the shadow.
         for r in missing:
-            bits = masks_of(
-                replace(scene, points=points[r : r + 1], triangles=triangles[r : r + 1]), "reference"
-            )
-            assert not bits.any()
+            pair = replace(scene, points=points[r : r + 1], triangles=triangles[r : r + 1])
+            assert not masks_of(pair, "reference", index=np.array([r])).any()
         assert len(missing) < 0.05 * len(points) or offset > 0
 
 
@@ -231,9 +232,77 @@ def test_no_receiver_and_no_blocker() -> None:
     assert (result.visibility == 1).all()
 
 
+def test_seconds_are_named_as_those_of_hpc_and_steps_are_parts_of_them() -> None:
+    scene = large_scene(3000, 300, light_named("square above", 16))
+    gears = cast_scene(scene, "gears", options=CastOptions(rebuild_fraction=1e-9)).stats
+    assert list(gears.seconds) == list(cast_scene(scene, "hpc").stats.seconds) == ["hierarchy", "cast"]
+    steps = {f"cast_{step}" for step in ("bound", "count", "prefix_sum", "fill", "rasterise", "bin")}
+    assert set(gears.step_seconds) == steps
+    assert 0 < sum(gears.step_seconds.values()) <= gears.seconds["cast"]
+    numbers = gears.as_dict()
+    assert all(0 <= numbers[f"seconds_{step}"] <= numbers["seconds_cast"] for step in steps)
+    # The time of all: nothing counts twice, of one run or of two.
+    assert header_attributes({"lights": [{"name": "key"}]}, gears, "")["penumbra:seconds"] == pytest.approx(
+        gears.seconds["hierarchy"] + gears.seconds["cast"]
+    )
+    both = Stats("gears")
+    for _ in range(2):
+        both.merge(gears)
+    assert both.step_seconds == {step: 2 * seconds for step, seconds in gears.step_seconds.items()}
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_light_with_thickness_hides_behind_deeper_blockers(seed: int) -> None:
     """Edges parallel but for 1e-9: some samples are deeper than the dust around, and than what hides them."""
     hard = hard_scene(cases_named(["light-is-a-sliver"])[0], SceneSize(1024, 128, 64), seed)
     scene = SmallScene(hard.points, hard.triangles, hard.light, None, hard.own)
     assert np.array_equal(masks_of(scene, "gears"), masks_of(scene, "reference"))
+
+
+def _rotated(rng: np.random.Generator) -> np.ndarray:
+    axes: np.ndarray = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return axes
+
+
+def test_one_sample_of_a_light_far_larger_than_the_scene() -> None:
+    """The sample is far from the light's centre: rounding there must not pass for rounding at the sample."""
+    n_blocked = 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        axes, size = _rotated(rng), (1e4, 1e6)[seed % 2]
+        u, v = axes[0] * size, axes[1] * size
+        corner = -RectLight((0, 0, 0), u, v, samples=1, sets=1, seed=seed).sample_points[0, 0]
+        light = RectLight(corner, u, v, samples=1, sets=1, seed=seed, two_sided=True)
+        sample = light.sample_points[0, 0]
+        centre = sample + 4.0 * (axes[2] + 0.3 * rng.normal(size=2) @ axes[:2])
+        spread = rng.normal(size=(1, 3, 2)) * 4.0 * 10.0 ** rng.uniform(-6, -0.5)
+        triangles = centre + spread @ axes[:2]
+        middle = triangles.mean(axis=1)
+        points = middle + (middle - sample) / 4.0 * size * 2.0**-53 * rng.uniform(0.1, 1)
+        scene = SmallScene(points, triangles, light)
+        masks = masks_of(scene, "reference")
+        assert np.array_equal(masks_of(scene, "gears", options=CastOptions(grid_resolution=4)), masks)
+        n_blocked += int(masks.any())
+    assert n_blocked > 20
+
+
+def test_a_blocker_within_an_ulp_of_its_receiver() -> None:
+    """One receiver, one blocker parallel to a rotated light: no neighbour hides a bound that is too tight."""
+    n_blocked = 0
+    for seed in range(600):
+        rng = np.random.default_rng(seed)
+        axes, centre = _rotated(rng), rng.normal(size=3)
+        corner = centre - 0.5 * axes[0] - 0.5 * axes[1]
+        light = RectLight(corner, axes[0], axes[1], samples=16, sets=1, two_sided=True)
+        far = 10.0 ** rng.integers(0, 4)
+        middle = centre + far * (rng.uniform(0.5, 1) * axes[2] + rng.normal(size=2) @ axes[:2])
+        spread = rng.normal(size=(1, 3, 2)) * far * 10.0 ** rng.uniform(-12, 0)
+        triangles = middle + spread @ axes[:2]
+        sample = light.sample_points[0, rng.integers(0, 16)]
+        on = triangles.mean(axis=1)
+        behind = np.spacing(far) * rng.choice([0.5, 1, 1.5, 2])
+        scene = SmallScene(on + (on - sample) / np.linalg.norm(on - sample) * behind, triangles, light)
+        masks = masks_of(scene, "reference")
+        assert np.array_equal(masks_of(scene, "gears", options=CastOptions(grid_resolution=300)), masks)
+        n_blocked += int(masks.any())
+    assert n_blocked > 50

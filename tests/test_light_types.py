@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import pytest
 
 import penumbra
@@ -13,6 +14,7 @@ from penumbra.errors import OutputError, SceneError
 from penumbra.io.exr import read_header, read_layers
 from penumbra.render import plan_render
 from penumbra.scene import Scene
+from penumbra.settings import settings_hash, settings_of
 
 LAMP = '\n[[light]]\nname = "lamp"\ntype = "point"\nposition = [0.9, 2, 0.4]\nintensity = 40\n'
 
@@ -48,14 +50,39 @@ def test_overrides_leave_points_alone(both: Path) -> None:
 
 # What is replaced in the scene of both lights, by what, and the words that the sentence must have.
 WRONG = {
-    "samples of a point": ("intensity = 40", "samples = 40", [":23:", "'samples'", "of type point"]),
+    "type forgotten": ('type = "point"\n', "", [":21:", "'position' is a key", ': add type = "point"']),
+    "type forgotten, intensity first": (
+        'type = "point"\nposition = [0.9, 2, 0.4]\nintensity = 40',
+        "intensity = 40\nposition = [0.9, 2, 0.4]",
+        [":21:", "'intensity' is a key", ': add type = "point" ([[light]] 2)'],
+    ),
+    "type rect for point": ('"point"', '"rect"', [":22:", "'position'", 'change type to "point"']),
+    "type point for rect": ('"rect"', '"point"', [":13:", "'corner'", 'change type to "rect"']),
+    "samples of a point": ("intensity", "samples", [":23:", "has one sample: leave 'samples' out"]),
+    "sets of a point": ("intensity", "sets", [":23:", "has one sample: leave 'sets' out"]),
+    "pattern of a point": (
+        "intensity = 40",
+        'pattern = "regular"',
+        [":23:", "has one sample: leave 'pattern' out"],
+    ),
+    "radiance of a point": ("intensity", "radiance", [":23:", "a point light has 'intensity'"]),
+    "intensity of a rect": ("radiance", "intensity", [":17:", "a rect light has 'radiance'"]),
+    "point shining to a side": (
+        "intensity = 40",
+        "two_sided = false",
+        [":23:", "shines all round: leave 'two_sided' out"],
+    ),
     "corner of a point": (
         "intensity = 40",
         "corner = [0, 0, 0]",
-        [":23:", "'corner'", "(of name, type, posi"],
+        [":23:", "'corner'", "a point light has 'position'"],
     ),
     "misspelt": ("intensity", "intensty", [":23:", "'intensty'", "nearest valid key is 'intensity'"]),
-    "position of a rect": ("samples = 16", "position = [0, 0, 0]", [":16:", "'position'", "of type rect"]),
+    "position of a rect": (
+        "samples = 16",
+        "position = [0, 0, 0]",
+        [":16:", "'position'", "a rect light has 'corner'"],
+    ),
     "no position": ("position = [0.9, 2, 0.4]\n", "", ["'position' is missing", "three finite numbers"]),
     "type of no light": ('"point"', '"pont"', [":21:", "'type'", '"rect" or "point"']),
     "type as a list": ('"point"', '["point"]', [":21:", "'type'", '"rect" or "point"']),
@@ -164,7 +191,7 @@ def test_regular_samples_are_the_centres_of_the_strata(samples: int) -> None:
     vectors = ((-1, 3, -1), (2, 0.3, 0), (0, 0.2, 2))
     regular = RectLight(*vectors, samples=samples, sets=3, pattern="regular")
     points = regular.sample_points
-    assert points.shape == (3, samples, 3) and (points == points[0]).all()
+    assert points.shape == (1, samples, 3)
     # The mean of many jittered sets tends to the centres: strata have the same place and size.
     jittered = RectLight(*vectors, samples=samples, sets=256).sample_points
     # A mean of 256 is off by a sixteenth of one jitter, which is 0.29 of a stratum.
@@ -187,6 +214,44 @@ def test_patterns_in_scene_files(scene_file: Path) -> None:
     assert light.settings()["pattern"] == "regular" and light.samples == 9
     with pytest.raises(SceneError, match="pattern of light 'key'"):
         RectLight((0, 0, 0), (1, 0, 0), (0, 1, 0), name="key", pattern="sobol")
+
+
+def test_all_sets_of_regular_samples_are_one(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain = scene_file.read_text() + 'pattern = "regular"\n'
+    hashes = []
+    for text in (plain, plain + "sets = 5\n"):
+        scene_file.write_text(text)
+        plan = plan_render(scene_file)
+        assert "key: 16 samples in 1 set\n" in str(plan) and "no choice of sample set" in str(plan)
+        scene = Scene.load(scene_file)
+        hashes.append(settings_hash(settings_of(scene, (0, 0, 32, 24))))
+        points, normals, own, pixel = penumbra.camera_receivers(scene)
+        result = penumbra.cast(points, np.zeros((0, 3, 3)), scene.lights[0], index=pixel)
+        assert not result.sample_set.any()
+        assert run(["info", str(scene_file), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["light"][0]["sets"] == 1
+    assert hashes[0] == hashes[1]
+    with pytest.raises(SceneError, match="sets of light 'light' is 0"):
+        RectLight((0, 0, 0), (1, 0, 0), (0, 1, 0), sets=0, pattern="regular")
+
+
+@pytest.mark.parametrize(("backend", "named"), [("hpc", "hpc"), ("gears", "gears"), ("auto", "hpc (auto)")])
+def test_the_plan_names_the_backend(both: Path, backend: str, named: str) -> None:
+    assert f"\nbackend    {named}\n" in str(plan_render(both, backend=backend))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("intensity", ["1e-45", "1e-40", "1e38", "1e60"])
+def test_a_preview_of_any_brightness(intensity: str, lamp_only: Path) -> None:
+    """Radiance beyond the largest float32 is infinite in the layers; the preview still shows the shadow."""
+    lamp_only.write_text(lamp_only.read_text().replace("intensity = 40", f"intensity = {intensity}"))
+    preview = lamp_only.with_suffix(".png")
+    image = penumbra.render(lamp_only, preview=preview)
+    grey, background = np.array(PIL.Image.open(preview)), image.layers["id"] == 0xFFFFFFFF
+    lit = (image.layers["R"] > 0) & ~background
+    assert (grey[~lit & ~background] == 0).all()
+    if lit.any():
+        assert np.median(grey[lit]) > 100
 
 
 def test_the_jittered_pattern_has_not_changed() -> None:

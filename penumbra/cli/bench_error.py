@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from penumbra.cli import options
-from penumbra.cli.console import Console, result
+from penumbra.cli.console import Console, deliver, result
 
 
 def _samples(_context: click.Context, _parameter: click.Parameter, value: str) -> tuple[int, ...]:
@@ -43,20 +43,18 @@ _sample_counts = click.option(
     callback=_samples,
     default="16,32,64,128,256,512,1024",
     show_default=True,
-    help="Numbers of light samples to measure.",
+    help="Numbers of light samples to measure, from 1 to 65536.",
 )
 _reference = click.option(
     "--reference",
     metavar="N",
     type=click.IntRange(min=2),
-    default=16384,
-    show_default=True,
-    help="Light samples of the reference; an even number.",
+    help="Light samples of the reference: an even number, from twice the most of --samples to 131072"
+    " (default: 16 times the most of --samples, at least 16384).",
 )
 _backend = click.option(
     "--backend",
     "backends",
-    metavar="NAME",
     multiple=True,
     type=click.Choice([name for name in options.BACKENDS if name != "auto"]),
     help="A backend to measure; may be given more than once (default: hpc and gears).",
@@ -90,20 +88,34 @@ def error(
 
     Each backend casts the points that the camera sees with each number of samples, on a regular grid and
     jittered, and is compared with a reference of many samples: errors, seconds, peak memory, and how fast
-    the error falls.
+    the error falls. Ctrl-C prints what is finished, and writes nothing.
 
     Example: penumbra bench error scene.toml -o measured --samples 16,64,256
     """
-    from penumbra.measure.error import DEFAULT_BACKENDS, ErrorOptions, measure_error
-    from penumbra.measure.error_report import prepare_error_outputs
+    from penumbra.errors import SceneError
+    from penumbra.measure.backends import DEFAULT_BACKENDS
+    from penumbra.measure.error import ErrorOptions, measure_error
+    from penumbra.measure.error_report import ErrorReport, prepare_error_outputs
 
     settings["backends"] = settings["backends"] or DEFAULT_BACKENDS
-    chosen = ErrorOptions(**settings)
+    try:
+        chosen = ErrorOptions(**settings)
+    except SceneError as problem:
+        raise click.UsageError(str(problem)) from None
     paths = prepare_error_outputs(output, overwrite) if output is not None else []
-    with context.ensure_object(Console).progress() as progress:
-        report = measure_error(scene, chosen, memory=memory, process_limit=True, progress=progress)
-    if paths:
-        report.write(paths)
-    result(report)
-    for path in paths:
-        result(path)
+    stopped: list[ErrorReport] = []
+    try:
+        with context.ensure_object(Console).progress() as progress:
+            report = measure_error(
+                scene,
+                chosen,
+                memory=memory,
+                process_limit=True,
+                progress=progress,
+                on_stop=stopped.append,
+            )
+    finally:
+        # Not before: the progress bar has left its line by now.
+        for unfinished in stopped:
+            result(unfinished)
+    deliver(report, paths)

@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from penumbra.cli import options
-from penumbra.cli.console import Console, result
+from penumbra.cli.console import Console, deliver
 
 scenes = click.argument("scenes", metavar="[SCENE]...", nargs=-1)
 _output = click.option(
@@ -92,8 +92,4 @@ def peers(
     paths = prepare_peer_outputs(output, overwrite) if output is not None else []
     with named_scenes(scenes, scratch) as found, context.ensure_object(Console).progress() as progress:
         report = measure_peers(found, chosen, scratch, progress)
-    if paths:
-        report.write(paths)
-    result(report)
-    for path in paths:
-        result(path)
+    deliver(report, paths)

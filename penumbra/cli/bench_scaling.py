@@ -7,7 +7,7 @@ import click
 
 from penumbra.cli import options
 from penumbra.cli.bench_peers import light, rounds, scenes, sets
-from penumbra.cli.console import Console, result
+from penumbra.cli.console import Console, deliver
 
 _AXES = ("triangles", "resolution", "samples", "area")
 
@@ -21,10 +21,9 @@ _output = click.option(
 _axis = click.option(
     "--axis",
     "axes",
-    metavar="NAME",
     multiple=True,
     type=click.Choice(_AXES),
-    help="What to vary: triangles, resolution, samples or area; may be given more than once (default: all).",
+    help="What to vary; may be given more than once (default: all).",
 )
 _levels = click.option(
     "--levels",
@@ -95,8 +94,4 @@ def scaling(
     paths = prepare_scaling_outputs(output, overwrite) if output is not None else []
     with named_scenes(scenes, scratch) as found, context.ensure_object(Console).progress() as progress:
         report = measure_scaling(found, chosen, scratch, progress)
-    if paths:
-        report.write(paths)
-    result(report)
-    for path in paths:
-        result(path)
+    deliver(report, paths)

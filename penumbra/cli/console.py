@@ -2,10 +2,11 @@
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -40,6 +41,18 @@ class Console:
 def result(text: object) -> None:
     """Print a result on stdout."""
     click.echo(str(text))
+
+
+def deliver(report: Any, paths: Sequence[Path]) -> None:
+    """Print a report, write its files if there are paths, and print those: none failing costs the others."""
+    try:
+        result(report)
+        flush_results()
+    finally:
+        if paths:
+            report.write(paths)
+    for path in paths:
+        result(path)
 
 
 def error(message: str) -> None:

@@ -32,10 +32,16 @@ def write_png(path: str | os.PathLike[str], radiance: Float32Array, background: 
 
 
 def expose(radiance: Float32Array, background: NDArray[np.bool_]) -> UInt8Array:
-    """Grey levels, uint8 (height, width): automatic exposure, a soft shoulder, the sRGB curve."""
-    lit = radiance[~background & (radiance > 0)]
-    white = float(np.percentile(lit, _EXPOSURE_PERCENTILE)) if lit.size else 1.0
-    linear = np.maximum(radiance, 0) * np.float32(_KNEE / white)
+    """Grey levels, uint8 (height, width): automatic exposure, a soft shoulder, the sRGB curve.
+
+    Infinite radiance counts as the largest float32.
+    """
+    linear = np.maximum(np.nan_to_num(radiance), np.float32(0))
+    lit = linear[~background & (linear > 0)]
+    white = np.float32(np.percentile(lit, _EXPOSURE_PERCENTILE) if lit.size else 1.0)
+    # Divided, for 1 / white may overflow in a very dark picture; so may what is brightest there.
+    with np.errstate(over="ignore"):
+        linear = linear / white * np.float32(_KNEE)
     above = np.maximum(linear - _KNEE, 0)
     linear = np.minimum(linear, _KNEE) + (1 - _KNEE) * -np.expm1(-above / (1 - _KNEE))
     grey = np.round(255 * _srgb(linear)).astype(np.uint8)

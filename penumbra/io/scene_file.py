@@ -71,8 +71,7 @@ def read_scene(path: str | Path) -> Scene:
     for kind, of_kind in tables.items():
         for table in of_kind:
             if kind == "light":
-                of_type = _light_type(table)
-                table.check_keys(LIGHT_KEYS[of_type], f"{table.label} of type {of_type}")
+                _check_light_keys(table)
             else:
                 table.check_keys(TABLE_KEYS[kind], table.label)
     geometry = tuple(_geometry(table) for table in tables["geometry"])
@@ -158,6 +157,40 @@ def _camera(table: _Table) -> Camera:
 def _light_type(table: _Table) -> str:
     found: str = table.given({"type": _LIGHT_TYPE}).get("type", "rect")
     return found
+
+
+def _check_light_keys(table: _Table) -> None:
+    """Refuse the first key that belongs to another type of light, or to none."""
+    of_type = _light_type(table)
+    for key in table.values:
+        if key in TABLE_KEYS["light"] and key not in LIGHT_KEYS[of_type]:
+            hint = _hint_for_point(table, key) if of_type == "point" else _hint_for_rect(table, key)
+            table.refuse(f"{hint} ({table.label})", key)
+    table.check_keys(LIGHT_KEYS[of_type], f"{table.label} of type {of_type}")
+
+
+def _hint_for_rect(table: _Table, key: str) -> str:
+    """What to do about a key of point lights in a rect light: mostly, `type` was forgotten."""
+    has_corner = "corner" in table.values
+    if key == "intensity" and (has_corner or "position" not in table.values):
+        return "'intensity' is for point lights, a rect light has 'radiance'"
+    if has_corner:
+        return f"'{key}' is for point lights, a rect light has 'corner': leave one of them out"
+    change = "change type to" if "type" in table.values else "add type ="
+    return f'\'{key}\' is a key of lights of type "point": {change} "point"'
+
+
+def _hint_for_point(table: _Table, key: str) -> str:
+    """What to do about a key of rect lights in a point light."""
+    if key in ("samples", "sets", "pattern"):
+        return f"a point light has one sample: leave '{key}' out"
+    if key == "radiance":
+        return "'radiance' is for rect lights, a point light has 'intensity'"
+    if key == "two_sided":
+        return "a point light shines all round: leave 'two_sided' out"
+    if "position" in table.values:
+        return f"'{key}' is for rect lights, a point light has 'position': leave one of them out"
+    return f"'{key}' is a key of lights of type \"rect\": change type to \"rect\", or give 'position' instead"
 
 
 def _light(table: _Table) -> Light:

@@ -281,7 +281,8 @@ def rasterise(slots, grid, raster, chunk, begin, blockers, light, scratch, count
     grid, raster, chunk, light = borrow(grid), borrow(raster), borrow(chunk), borrow(light)
     begin, blockers, scratch, counters = borrow(begin), borrow(blockers), borrow(scratch), borrow(counters)
     n_full = np.int64(0)
-    slot, cell = np.int64(slots[0]), np.int64(0)
+    slot = np.int64(slots[0])
+    cell = np.searchsorted(grid.first, slot, side="right") - 1
     while slot < slots[1]:
         while grid.first[cell + 1] <= slot:
             cell += 1

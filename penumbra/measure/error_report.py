@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from penumbra.measure.cost import Cost
 from penumbra.measure.metrics import ErrorMetrics, PowerLaw, fit_power_law, without_floor
-from penumbra.measure.report import aligned_table, prepare_outputs, write_csv, write_json
+from penumbra.measure.report import aligned_table, prepare_outputs, write_outputs
 from penumbra.memory import format_bytes
 
 FILES = ("error.json", "error.csv", "error.png")
@@ -86,7 +86,13 @@ class ErrorReport:
     """Everything that `bench error` measured; `str()` is what it prints."""
 
     scene: str
+    scene_path: str | None
+    date: str
+    """When it was finished, ISO 8601, UTC."""
+    camera: dict[str, Any]
     light: str
+    light_settings: dict[str, Any]
+    """By the keys of a scene file, without those that differ from row to row."""
     resolution: tuple[int, int]
     n_triangles: int
     n_receivers: int
@@ -105,6 +111,8 @@ class ErrorReport:
     slopes: tuple[Slope, ...]
     peak_bytes: int
     """Highest resident memory of the process."""
+    is_complete: bool
+    """False where the measuring was stopped, so that rows are missing."""
     machine: dict[str, Any]
 
     @property
@@ -133,15 +141,15 @@ class ErrorReport:
         """Write JSON, CSV and the plot to the paths that `prepare_error_outputs` gave."""
         from penumbra.measure.plots import draw_error
 
-        json_path, csv_path, png_path = paths
-        write_csv(csv_path, [row.as_dict() for row in self.rows])
-        draw_error(self, png_path)
-        # Last: programs that wait for it then find all three.
-        write_json(json_path, self.as_dict())
+        rows = [row.as_dict() for row in self.rows]
+        write_outputs(paths, self.as_dict(), rows, lambda path: draw_error(self, path))
 
     def __str__(self) -> str:
         """Return what was measured as lines and tables of text."""
-        blocks = (self._facts(), self._error_table(), self._cost_table(), self._slope_table())
+        blocks = [self._facts(), self._error_table(), self._cost_table(), self._slope_table()]
+        if not self.is_complete:
+            rows = "1 row is" if len(self.rows) == 1 else f"{len(self.rows)} rows are"
+            blocks.insert(0, f"INCOMPLETE: the measuring was stopped when {rows} finished")
         return "\n\n".join(blocks)
 
     def _facts(self) -> str:

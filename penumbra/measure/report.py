@@ -4,7 +4,8 @@ import csv
 import json
 import os
 import platform
-from collections.abc import Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ def prepare_outputs(folder: Path, names: Sequence[str], overwrite: bool) -> list
         raise OutputError(
             f"cannot make the folder {folder}: {problem.strerror}; choose another place"
         ) from None
+    _check_writable(folder)
     paths = [folder / name for name in names]
     for path in paths:
         check_output(path)
@@ -37,6 +39,38 @@ def prepare_outputs(folder: Path, names: Sequence[str], overwrite: bool) -> list
             raise OutputError(f"{path} is there already: give --overwrite to replace it, or another folder")
         remove_dead_temporaries(path)
     return paths
+
+
+def _check_writable(folder: Path) -> None:
+    """Write a little and remove it: permissions alone do not tell of a full or broken disk."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(4096))
+    except OSError as problem:
+        raise OutputError(f"cannot write in {folder}: {problem.strerror}; choose another folder") from None
+
+
+def write_outputs(
+    paths: Sequence[Path], facts: Row, rows: Sequence[Row], draw: Callable[[Path], None] | None = None
+) -> None:
+    """Write facts as JSON, rows as CSV and then, if `draw` is given, the plot, to paths in this order.
+
+    The plot is last: whatever fails in drawing costs no number. Raises OutputError.
+    """
+    write_json(paths[0], facts)
+    write_csv(paths[1], rows)
+    if draw is None:
+        return
+    try:
+        draw(paths[2])
+    except (OutputError, OSError):
+        raise
+    except Exception as problem:
+        # matplotlib, its fonts and its compiled parts fail in ways that nobody can list.
+        what = f"{type(problem).__name__}: {problem}".splitlines()[0]
+        raise OutputError(
+            f"cannot draw {paths[2]} ({what}); {paths[0].name} and {paths[1].name} are written"
+        ) from problem
 
 
 def write_json(path: Path, facts: Mapping[str, Any]) -> None:

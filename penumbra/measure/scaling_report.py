@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from penumbra.measure.metrics import PowerLaw, fit_power_law
 from penumbra.measure.peer_process import Answer
-from penumbra.measure.report import aligned_table, prepare_outputs, write_csv, write_json
+from penumbra.measure.report import aligned_table, prepare_outputs, write_outputs
 from penumbra.measure.side_by_side import Rounds
 
 FILES = ("scaling.json", "scaling.csv", "scaling.png")
@@ -138,13 +138,10 @@ class ScalingReport:
         """Write JSON, CSV and the plot to the paths that `prepare_scaling_outputs` gave."""
         from penumbra.measure.plots_speed import draw_scaling
 
-        json_path, csv_path, png_path = paths
         rows = [row.as_dict() for row in self.rows]
         keys = dict.fromkeys(key for row in rows for key in row)
-        write_csv(csv_path, [dict.fromkeys(keys) | row for row in rows])
-        draw_scaling(self, png_path)
-        # Last: programs that wait for it then find all three.
-        write_json(json_path, self.as_dict())
+        rows = [dict.fromkeys(keys) | row for row in rows]
+        write_outputs(paths, self.as_dict(), rows, lambda path: draw_scaling(self, path))
 
     def __str__(self) -> str:
         """Return what was measured as tables of text."""

@@ -16,17 +16,11 @@ from penumbra.api import CastResult, backend_named, cast
 from penumbra.arrays import UInt64Array
 from penumbra.errors import SceneError
 from penumbra.executors.threads import resolve_threads, run_tasks
-from penumbra.measure.error import DEFAULT_BACKENDS
+from penumbra.measure.backends import DEFAULT_BACKENDS
 from penumbra.measure.report import machine_facts
-from penumbra.measure.stability_cases import (
-    ORDINARY,
-    Case,
-    HardScene,
-    SceneSize,
-    cases_named,
-    hard_scene,
-)
-from penumbra.measure.stability_report import StabilityReport, StabilityRow, WrongBit
+from penumbra.measure.stability_cases import cases_named, ordinary_of
+from penumbra.measure.stability_report import PLAIN, StabilityReport, StabilityRow, WrongBit
+from penumbra.measure.stability_scene import Case, HardScene, SceneSize, hard_scene
 from penumbra.progress import NullProgress, Progress
 
 JUDGE = "reference"
@@ -44,8 +38,11 @@ SCALES_AND_OFFSETS = (
 
 _REPEATS = 5
 _REPEAT_SECONDS = 0.25
-# All times are divided by the ordinary scene's, which is the shortest.
+# All times are divided by those of the two ordinary scenes, which are the shortest.
 _ORDINARY_REPEATS = 25
+
+Timed = tuple[CastResult, float]
+"""What was cast, and the median of its processor seconds."""
 
 
 @dataclass(frozen=True)
@@ -84,36 +81,46 @@ def measure_stability(
     options = options or StabilityOptions()
     progress = progress or NullProgress()
     cases = cases_named(options.cases)
-    small, threads = hard_scene(ORDINARY, QUICK_SIZE), resolve_threads(options.threads)
-    for backend in (JUDGE, *options.backends):
-        _cast(small, backend)  # so that no kernel is compiled while the time is taken
-    ordinary = hard_scene(ORDINARY, options.size, options.seed)
-    ordinary_seconds = {
-        backend: _timed_cast(ordinary, backend, threads, _ORDINARY_REPEATS)[1] for backend in options.backends
+    threads = resolve_threads(options.threads)
+    ordinary = {
+        case.name: _cast_ordinary(case, options, threads)
+        for case in dict.fromkeys(ordinary_of(case) for case in cases)
     }
     progress.stage("stability", len(cases) * len(SCALES_AND_OFFSETS), "scenes")
-    rows = [row for case in cases for row in _judge_case(case, options, threads, ordinary_seconds, progress)]
+    rows = [row for case in cases for row in _judge_case(case, options, threads, ordinary, progress)]
     return StabilityReport(
         receivers=options.size.n_receivers,
         blockers=options.size.n_blockers,
         samples=options.size.n_samples,
+        point_receivers=options.size.n_point_receivers,
         scenes=len(cases) * len(SCALES_AND_OFFSETS),
         seed=options.seed,
         quick=options.quick,
         threads=threads,
         backends=tuple(options.backends),
         cases={case.name: case.what for case in cases},
-        ordinary_cpu_seconds=ordinary_seconds,
+        ordinary_cpu_seconds={
+            case: {backend: seconds for backend, (_, seconds) in timed.items()}
+            for case, timed in ordinary.items()
+        },
         rows=tuple(rows),
         machine=machine_facts(),
     )
+
+
+def _cast_ordinary(case: Case, options: StabilityOptions, threads: int) -> dict[str, Timed]:
+    """What every backend takes for an ordinary case; no kernel is compiled while the time is taken."""
+    small, scene = hard_scene(case, QUICK_SIZE), hard_scene(case, options.size, options.seed)
+    for backend in (JUDGE, *options.backends):
+        _cast(small, backend)
+    return {backend: _timed_cast(scene, backend, threads, _ORDINARY_REPEATS) for backend in options.backends}
 
 
 def _judge_case(
     case: Case,
     options: StabilityOptions,
     threads: int,
-    ordinary_seconds: dict[str, float],
+    ordinary: dict[str, dict[str, Timed]],
     progress: Progress,
 ) -> Iterator[StabilityRow]:
     """Rows of all scales, offsets and backends of a case, in this order."""
@@ -124,7 +131,9 @@ def _judge_case(
     judged = run_tasks(lambda scene: _masks(_cast(scene, JUDGE)), scenes, threads)
     for (scale, offset), scene, expected in zip(SCALES_AND_OFFSETS, scenes, judged, strict=True):
         for backend in options.backends:
-            result, seconds = _timed_cast(scene, backend, threads)
+            # The ordinary scene itself has been cast and timed.
+            timed = ordinary.get(case.name, {}) if (scale, offset) == PLAIN else {}
+            result, seconds = timed.get(backend) or _timed_cast(scene, backend, threads)
             counters: dict[str, Any] = result.stats.as_dict()
             first, n_wrong = _compare(_masks(result), expected)
             yield StabilityRow(
@@ -132,24 +141,30 @@ def _judge_case(
                 scale=scale,
                 offset=offset,
                 backend=backend,
-                bits=options.size.n_bits,
+                bits=scene.n_bits,
                 wrong_bits=n_wrong,
                 escalated_f64=counters["escalated_f64"],
                 escalated_exact=counters["escalated_exact"],
                 cpu_seconds=seconds,
-                times_ordinary=seconds / ordinary_seconds[backend],
+                times_ordinary=seconds / ordinary[ordinary_of(case).name][backend][1],
                 first_wrong=first,
             )
         progress.advance(1)
 
 
 def _cast(scene: HardScene, backend: str, threads: int = 1) -> CastResult:
-    return cast(scene.points, scene.triangles, scene.light, own=scene.own, backend=backend, threads=threads)
+    return cast(
+        scene.points,
+        scene.triangles,
+        scene.light,
+        normals=scene.normals,
+        own=scene.own,
+        backend=backend,
+        threads=threads,
+    )
 
 
-def _timed_cast(
-    scene: HardScene, backend: str, threads: int, repeats: int = _REPEATS
-) -> tuple[CastResult, float]:
+def _timed_cast(scene: HardScene, backend: str, threads: int, repeats: int = _REPEATS) -> Timed:
     """The result, and the median processor time of a few casts (of fewer where they are slow)."""
     seconds: list[float] = []
     while len(seconds) < repeats and sum(seconds) < _REPEAT_SECONDS:

@@ -1,89 +1,30 @@
-"""Scenes that break shadow algorithms, made of numbers alone: the same for the same seed.
+"""Scenes that break shadow algorithms, made of numbers alone: the same for the same seed."""
 
-Most coordinates are small multiples of a power of two, so that what is meant to lie on a plane, an edge
-or a vertex lies there exactly. Receivers are around z = 0, blockers between, the light around z = 4.
-"""
-
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 
 import numpy as np
 
-from penumbra.arrays import Float64Array, Int64Array
+from penumbra.arrays import Float64Array
 from penumbra.errors import SceneError
 from penumbra.lights import RectLight
-
-Rng = np.random.Generator
+from penumbra.measure.stability_point_cases import POINT_CASES, POINT_ORDINARY
+from penumbra.measure.stability_scene import (
+    Case,
+    HardScene,
+    Rng,
+    SceneSize,
+    general_blockers,
+    general_receivers,
+    halves,
+    on_grid,
+    scene_of,
+    torn_sheet,
+)
 
 CORNER = np.array([-1.0, -1.0, 4.0])
 # A rectangle that is tilted: no coordinate difference in its plane is zero by itself.
 EDGE_U = np.array([0.0, 2.0, 0.5])
 EDGE_V = np.array([2.0, 0.0, 0.0])
-
-# Each direction of an offset is different, so that no plane of the scene stays where it was.
-OFFSET_DIRECTION = np.array([1.0, -1.0, 0.5])
-
-
-@dataclass(frozen=True)
-class SceneSize:
-    """How many receivers, blockers and light samples a scene has: R, T and K >= 2."""
-
-    n_receivers: int
-    n_blockers: int
-    n_samples: int
-
-    @property
-    def n_bits(self) -> int:
-        """Bits that a cast of the scene decides."""
-        return self.n_receivers * self.n_samples
-
-
-@dataclass(frozen=True, eq=False)
-class HardScene:
-    """What `penumbra.cast` is given: points (R, 3), triangles (T, 3, 3), a light and own (R,)."""
-
-    points: Float64Array
-    triangles: Float64Array
-    light: RectLight
-    own: Int64Array
-
-    def transformed(self, scale: float, offset: float) -> "HardScene":
-        """The scene times `scale`, moved by `offset` along each of OFFSET_DIRECTION; float64 rounds."""
-        move = OFFSET_DIRECTION * offset
-        light = self.light
-        return replace(
-            self,
-            points=self.points * scale + move,
-            triangles=self.triangles * scale + move,
-            light=replace(
-                light,
-                corner=light.corner * scale + move,
-                edge_u=light.edge_u * scale,
-                edge_v=light.edge_v * scale,
-            ),
-        )
-
-
-@dataclass(frozen=True)
-class Case:
-    """A kind of scene: its name, what is hard about it, and what makes it."""
-
-    name: str
-    what: str
-    make: Callable[[Rng, SceneSize], HardScene]
-    nudged: bool = False
-    """Move every coordinate of receivers and blockers by one ulp up or down, or not, in the end."""
-
-
-def hard_scene(
-    case: Case, size: SceneSize, seed: int = 0, scale: float = 1.0, offset: float = 0.0
-) -> HardScene:
-    """The scene of a case, scaled and then moved; the same seed gives the same scene."""
-    rng = np.random.default_rng([seed, *case.name.encode()])
-    scene = case.make(rng, size).transformed(scale, offset)
-    if case.nudged:
-        scene = replace(scene, points=_nudged(rng, scene.points), triangles=_nudged(rng, scene.triangles))
-    return scene
 
 
 def cases_named(names: Sequence[str]) -> tuple[Case, ...]:
@@ -95,20 +36,26 @@ def cases_named(names: Sequence[str]) -> tuple[Case, ...]:
     return tuple(case for case in CASES if not names or case.name in names)
 
 
+def ordinary_of(case: Case) -> Case:
+    """The case in general position that the times of a case are over: that with the same type of light."""
+    return POINT_ORDINARY if case.has_point_light else ORDINARY
+
+
 def ordinary(rng: Rng, size: SceneSize) -> HardScene:
     """Triangles, receivers and samples in general position: what the hard cases are timed against."""
-    return _scene(_receivers(rng, size.n_receivers), _blockers(rng, size.n_blockers), _light(rng, size))
+    points, blockers = general_receivers(rng, size.n_receivers), general_blockers(rng, size.n_blockers)
+    return scene_of(points, blockers, _light(rng, size))
 
 
 def through_the_light(rng: Rng, size: SceneSize) -> HardScene:
     """Half of the blockers pass through the light."""
     n_through = size.n_blockers // 2
     inside = _in_light_plane(rng.integers(1, 16, (n_through, 2)) / 16.0)
-    first, second = _on_grid(rng.normal(0, 0.5, (2, n_through, 3)), 64)
+    first, second = on_grid(rng.normal(0, 0.5, (2, n_through, 3)), 64)
     # The point inside the light is (a + b + 2 c) / 4.
     through = np.stack([first, second, -0.5 * (first + second)], axis=1) + inside[:, None]
-    blockers = np.concatenate([through, _blockers(rng, size.n_blockers - n_through)])
-    return _scene(_receivers(rng, size.n_receivers), blockers, _light(rng, size))
+    blockers = np.concatenate([through, general_blockers(rng, size.n_blockers - n_through)])
+    return scene_of(general_receivers(rng, size.n_receivers), blockers, _light(rng, size))
 
 
 def touching_the_light(rng: Rng, size: SceneSize) -> HardScene:
@@ -120,11 +67,11 @@ def touching_the_light(rng: Rng, size: SceneSize) -> HardScene:
         rng.integers(1, size.n_samples, size.n_blockers),
     )
     at_sample = light.sample_points[0][np.stack([first, (first + step) % size.n_samples], axis=1)]
-    reach = _on_grid(rng.normal([0, 0, -1], [0.7, 0.7, 0.5], (size.n_blockers, 2, 3)), 64)
+    reach = on_grid(rng.normal([0, 0, -1], [0.7, 0.7, 0.5], (size.n_blockers, 2, 3)), 64)
     triangles = at_sample[:, :1] + np.concatenate([np.zeros_like(reach[:, :1]), reach], axis=1)
     triangles[1::3, 1] = at_sample[1::3, 1]
     triangles[2::3, 0] = at_sample[2::3, 0] - reach[2::3, 0]
-    return _scene(_receivers(rng, size.n_receivers), triangles, light)
+    return scene_of(general_receivers(rng, size.n_receivers), triangles, light)
 
 
 def in_the_light_plane(rng: Rng, size: SceneSize) -> HardScene:
@@ -134,16 +81,16 @@ def in_the_light_plane(rng: Rng, size: SceneSize) -> HardScene:
     flat[:2] = _in_light_plane(np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], float))[
         : len(flat)
     ]
-    blockers = np.concatenate([flat, _blockers(rng, size.n_blockers - n_flat)])
-    return _scene(_receivers(rng, size.n_receivers), blockers, _light(rng, size, exact=True))
+    blockers = np.concatenate([flat, general_blockers(rng, size.n_blockers - n_flat)])
+    return scene_of(general_receivers(rng, size.n_receivers), blockers, _light(rng, size, exact=True))
 
 
 def receivers_on_planes(rng: Rng, size: SceneSize) -> HardScene:
     """Every receiver lies in the plane of a blocker, inside of it, at its rim or beside it."""
-    blockers = _blockers(rng, size.n_blockers, cells=16)
+    blockers = general_blockers(rng, size.n_blockers, cells=16)
     a, b, c = np.moveaxis(rng.choice(blockers, size.n_receivers), 1, 0)
     weights = rng.integers(-8, 13, (2, size.n_receivers, 1)) / 8.0
-    return _scene(a + weights[0] * (b - a) + weights[1] * (c - a), blockers, _light(rng, size))
+    return scene_of(a + weights[0] * (b - a) + weights[1] * (c - a), blockers, _light(rng, size))
 
 
 def receivers_on_edges(rng: Rng, size: SceneSize) -> HardScene:
@@ -165,18 +112,18 @@ def receivers_in_the_light_plane(rng: Rng, size: SceneSize) -> HardScene:
     blockers = _in_light_plane(parameters / 16.0)
     blockers[::2, 0, 2] += 0.5
     blockers[::2, 1, 2] -= 0.5
-    return _scene(points, blockers, light)
+    return scene_of(points, blockers, light)
 
 
 def grazing(rng: Rng, size: SceneSize) -> HardScene:
     """A sheet of triangles with holes; from each receiver, a sample lies exactly behind a vertex or edge."""
     light = _light(rng, size, exact=True)
-    sheet = _sheet(rng, size.n_blockers)
+    sheet = torn_sheet(rng, size.n_blockers)
     weights = rng.choice(np.array([[4, 0, 0], [2, 2, 0], [1, 3, 0]]) / 4.0, size.n_receivers)
     behind = np.einsum("rk,rkc->rc", weights, rng.choice(sheet, size.n_receivers))
     times = rng.choice([1.0, 3.0], (size.n_receivers, 1))
     samples = rng.choice(light.sample_points[0], size.n_receivers)
-    return _scene(behind + times * (behind - samples), sheet, light)
+    return scene_of(behind + times * (behind - samples), sheet, light)
 
 
 def slivers(rng: Rng, size: SceneSize) -> HardScene:
@@ -185,7 +132,7 @@ def slivers(rng: Rng, size: SceneSize) -> HardScene:
     wide = 10.0 ** rng.uniform(-16, -1, (size.n_blockers, 1)) * rng.normal(0, 1, (size.n_blockers, 3))
     along = np.where(rng.random((size.n_blockers, 1)) < 0.5, 1.0, rng.random((size.n_blockers, 1)))
     blockers = np.stack([a, b, a + (b - a) * along + wide], axis=1)
-    return _scene(_receivers(rng, size.n_receivers), blockers, _light(rng, size))
+    return scene_of(general_receivers(rng, size.n_receivers), blockers, _light(rng, size))
 
 
 def light_is_a_line(rng: Rng, size: SceneSize) -> HardScene:
@@ -198,8 +145,8 @@ def light_is_folded(rng: Rng, size: SceneSize) -> HardScene:
     return _flat_light(rng, size, EDGE_V, -0.5 * EDGE_V)
 
 
-def light_is_a_point(rng: Rng, size: SceneSize) -> HardScene:
-    """A light with both edges of length zero; half of the blockers have it in their planes."""
+def edges_are_zero(rng: Rng, size: SceneSize) -> HardScene:
+    """A rect light with both edges of length zero; half of the blockers have it in their planes."""
     return _flat_light(rng, size, np.zeros(3), np.zeros(3))
 
 
@@ -219,9 +166,9 @@ def light_is_a_sliver(rng: Rng, size: SceneSize) -> HardScene:
     points, triangles = rng.normal(0, width, (n_points, 3)), rng.normal(0, width, (n_blockers, 3, 3))
     points += CORNER + rng.uniform(-1, 2, (n_points, 1)) * EDGE_V
     triangles += CORNER + rng.uniform(-1, 2, (n_blockers, 1, 1)) * EDGE_V
-    return _scene(
-        np.concatenate([points, _receivers(rng, size.n_receivers - n_points)]),
-        np.concatenate([triangles, _blockers(rng, size.n_blockers - n_blockers)]),
+    return scene_of(
+        np.concatenate([points, general_receivers(rng, size.n_receivers - n_points)]),
+        np.concatenate([triangles, general_blockers(rng, size.n_blockers - n_blockers)]),
         light,
     )
 
@@ -242,23 +189,9 @@ CASES = (
     Case("light-is-a-line", "a light without width", light_is_a_line),
     Case("light-is-folded", "a light with parallel edges", light_is_folded),
     Case("light-is-a-sliver", "a light 1e9 times as long as wide, and dust around it", light_is_a_sliver),
-    Case("light-is-a-point", "a light without extent", light_is_a_point),
+    Case("edges-are-zero", "a rect light whose edges are both zero", edges_are_zero),
+    *POINT_CASES,
 )
-
-
-def _on_grid(values: Float64Array, cells: int) -> Float64Array:
-    rounded: Float64Array = np.round(values * cells) / cells
-    return rounded
-
-
-def _receivers(rng: Rng, n_receivers: int) -> Float64Array:
-    return _on_grid(rng.uniform([-2, -2, -0.5], [2, 2, 0.5], (n_receivers, 3)), 1024)
-
-
-def _blockers(rng: Rng, n_blockers: int, cells: int = 1024) -> Float64Array:
-    """Triangles between receivers and light, of about a fifth of the size of the scene."""
-    centres = rng.uniform([-1.5, -1.5, 1], [1.5, 1.5, 3], (n_blockers, 1, 3))
-    return _on_grid(centres + rng.normal(0, 0.25, (n_blockers, 3, 3)), cells)
 
 
 def _light(rng: Rng, size: SceneSize, *, exact: bool = False, two_sided: bool = False) -> RectLight:
@@ -281,37 +214,12 @@ def _in_light_plane(parameters: Float64Array) -> Float64Array:
     return points
 
 
-def _scene(
-    points: Float64Array, triangles: Float64Array, light: RectLight, own: Int64Array | None = None
-) -> HardScene:
-    if own is None:
-        own = np.full(len(points), -1)
-    return HardScene(np.ascontiguousarray(points), np.ascontiguousarray(triangles), light, own)
-
-
-def _sheet(rng: Rng, n_blockers: int) -> Float64Array:
-    """Triangles of a tilted plane cut along a lattice: the half of its cells that chance has left."""
-    along, across, origin = np.array([[0.375, 0, 0.125], [0, 0.375, -0.0625], [-1.5, -1.5, 2.0]])
-    n_rows = int(np.ceil(np.sqrt(2 * n_blockers)))
-    lattice = np.stack(np.meshgrid(np.arange(n_rows + 1), np.arange(n_rows + 1), indexing="ij"), axis=-1)
-    lattice = lattice * (8.0 / 2.0 ** np.ceil(np.log2(n_rows)))
-    triangles = _halves(origin + lattice[..., :1] * along + lattice[..., 1:] * across)
-    return triangles[np.sort(rng.permutation(len(triangles))[:n_blockers])]
-
-
 def _hills(rng: Rng, n_blockers: int) -> Float64Array:
     """Triangles of a height field that throws shadows on itself."""
     n_rows = int(np.ceil(np.sqrt(n_blockers / 2)))
     x, y = np.meshgrid(np.arange(n_rows + 1), np.arange(n_rows + 1), indexing="ij")
     height = rng.integers(0, 9, x.shape) / 4.0
-    return _halves(np.stack([x * 0.5 - 2.0, y * 0.5 - 2.0, height], axis=-1))[:n_blockers]
-
-
-def _halves(grid: Float64Array) -> Float64Array:
-    """Triangles (2 n m, 3, 3) of the cells of a grid of points (n + 1, m + 1, 3)."""
-    a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
-    corners = np.stack([a, b, c, a, c, d], axis=2)
-    return corners.reshape(-1, 3, 3)
+    return halves(np.stack([x * 0.5 - 2.0, y * 0.5 - 2.0, height], axis=-1))[:n_blockers]
 
 
 def _on_hills(rng: Rng, size: SceneSize, weights: Float64Array) -> HardScene:
@@ -319,7 +227,7 @@ def _on_hills(rng: Rng, size: SceneSize, weights: Float64Array) -> HardScene:
     lies_on = rng.integers(0, len(hills), size.n_receivers)
     points = np.einsum("rk,rkc->rc", rng.choice(weights, size.n_receivers), hills[lies_on])
     own = np.where(rng.random(size.n_receivers) < 0.5, lies_on, -1)
-    return _scene(points, hills, _light(rng, size), own)
+    return scene_of(points, hills, _light(rng, size), own)
 
 
 def _flat_light(rng: Rng, size: SceneSize, edge_u: Float64Array, edge_v: Float64Array) -> HardScene:
@@ -329,21 +237,13 @@ def _flat_light(rng: Rng, size: SceneSize, edge_u: Float64Array, edge_v: Float64
     )
     n_edge_on = size.n_blockers // 8
     # One corner on the line of the light or between it and the other two, which are on a parallel line.
-    below = _blockers(rng, n_edge_on)[:, 0]
+    below = general_blockers(rng, n_edge_on)[:, 0]
     direction = edge_u if edge_u.any() else np.array([0.5, 0.25, 0.0])
     along = direction * rng.choice([-1.0, -0.5, 0.5, 1.0, 2.0], (2, n_edge_on, 1))
     down = rng.choice([0.0, 0.25, 0.5, 0.75], (n_edge_on, 1)) * (below - CORNER)
     edge_on = np.stack([below, CORNER + along[0] + down, below + 0.5 * along[1]], axis=1)
-    return _scene(
-        _receivers(rng, size.n_receivers),
-        np.concatenate([edge_on, _blockers(rng, size.n_blockers - n_edge_on)]),
+    return scene_of(
+        general_receivers(rng, size.n_receivers),
+        np.concatenate([edge_on, general_blockers(rng, size.n_blockers - n_edge_on)]),
         light,
     )
-
-
-def _nudged(rng: Rng, values: Float64Array) -> Float64Array:
-    steps = rng.integers(-1, 2, values.shape)
-    nudged: Float64Array = np.where(
-        steps == 0, values, np.nextafter(values, np.where(steps > 0, np.inf, -np.inf))
-    )
-    return nudged

@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from penumbra.errors import BackendError
-from penumbra.measure.report import aligned_table, prepare_outputs, write_csv, write_json
+from penumbra.measure.report import aligned_table, prepare_outputs, write_outputs
 
 FILES = ("stability.json", "stability.csv")
+
+PLAIN = (1.0, 0.0)
+"""The scale and offset of a scene as it was made."""
 
 
 class WrongBit(NamedTuple):
@@ -37,7 +40,8 @@ class StabilityRow(NamedTuple):
     """Determinants that needed exact integers."""
     cpu_seconds: float
     times_ordinary: float
-    """Processor time over that of the same backend in the ordinary scene at scale 1, offset 0."""
+    """Processor time over that of the same backend in the ordinary scene with the same type of light, at
+    scale 1, offset 0; of that scene itself, 1."""
     first_wrong: WrongBit | None
 
     @property
@@ -70,7 +74,9 @@ class StabilityReport:
     receivers: int
     blockers: int
     samples: int
-    """Of every scene."""
+    """Of every scene with a rect light."""
+    point_receivers: int
+    """Of every scene with a point light, which is one sample."""
     scenes: int
     seed: int
     quick: bool
@@ -78,8 +84,8 @@ class StabilityReport:
     backends: tuple[str, ...]
     cases: dict[str, str]
     """What is hard about each case, by its name."""
-    ordinary_cpu_seconds: dict[str, float]
-    """What each backend takes for the ordinary scene at scale 1, offset 0."""
+    ordinary_cpu_seconds: dict[str, dict[str, float]]
+    """What each backend takes for the ordinary scenes, by their names, at scale 1, offset 0."""
     rows: tuple[StabilityRow, ...]
     machine: dict[str, Any]
 
@@ -95,10 +101,7 @@ class StabilityReport:
 
     def write(self, paths: Sequence[Path]) -> None:
         """Write JSON and CSV to the paths that `prepare_stability_outputs` gave."""
-        json_path, csv_path = paths
-        write_csv(csv_path, [row.as_dict() for row in self.rows])
-        # Last: programs that wait for it then find both.
-        write_json(json_path, self.as_dict())
+        write_outputs(paths, self.as_dict(), [row.as_dict() for row in self.rows])
 
     def raise_if_wrong(self) -> None:
         """Raise BackendError if a bit is wrong; it says how to see the first one again."""
@@ -123,19 +126,23 @@ class StabilityReport:
         return f"{self._facts()}\n\n{self.table()}"
 
     def _facts(self) -> str:
-        seconds = ", ".join(
-            f"{name} {1e3 * seconds:.1f} ms" for name, seconds in self.ordinary_cpu_seconds.items()
-        )
         each = f"{self.receivers:,} receivers, {self.blockers:,} blockers, {self.samples:,} samples"
+        one = f"with a point light, {self.point_receivers:,} receivers and one sample"
         n_bits = sum(row.bits for row in self.rows)
-        lines = (
-            ("scenes", f"{self.scenes}, seed {self.seed}: {each} each"),
+        lines = [
+            ("scenes", f"{self.scenes}, seed {self.seed}: {each} each,"),
+            ("", one),
             ("judged", f"{n_bits:,} bits by exact brute force, {self.wrong_bits:,} wrong"),
-            ("ordinary", f"{seconds} of processor time at scale 1, offset 0"),
-            ("columns", "f64, exact: escalations for a million bits; time: over that of the ordinary scene;"),
-            ("", "each at scale 1, offset 0, and the worst of all scales and offsets"),
-        )
-        return "\n".join(f"{label:<10}{text}" for label, text in lines)
+        ]
+        for case, taken in self.ordinary_cpu_seconds.items():
+            each = ", ".join(f"{backend} {1e3 * seconds:.1f} ms" for backend, seconds in taken.items())
+            lines.append((case, f"{each} of processor time at scale 1, offset 0"))
+        lines += [
+            ("columns", "f64, exact: escalations for a million bits; time: over that of the ordinary scene"),
+            ("", "with the same type of light; each at scale 1, offset 0, and the worst of all scales and"),
+            ("", "offsets; the last column has the scale and the offset of the worst time"),
+        ]
+        return "\n".join(f"{label:<16}{text}" for label, text in lines)
 
     def table(self) -> str:
         """The table alone."""
@@ -143,7 +150,7 @@ class StabilityReport:
 
     def summary(self) -> tuple[list[str], list[list[str]]]:
         """Header and cells of the table: wrong bits are summed over scales and offsets."""
-        worst = ("f64", "f64 worst", "exact", "exact worst", "time", "time worst", "worst time at")
+        worst = ("f64", "f64 worst", "exact", "exact worst", "time", "time worst", "at scale, offset")
         header = ["case", "backend", "wrong bits", *worst]
         groups: dict[tuple[str, str], list[StabilityRow]] = {}
         for row in self.rows:
@@ -157,7 +164,7 @@ def prepare_stability_outputs(folder: Path, overwrite: bool) -> list[Path]:
 
 
 def _cells(rows: list[StabilityRow]) -> list[str]:
-    plain = next(row for row in rows if (row.scale, row.offset) == (1.0, 0.0))
+    plain = next(row for row in rows if (row.scale, row.offset) == PLAIN)
     slowest = max(rows, key=lambda row: row.times_ordinary)
     return [
         plain.case,

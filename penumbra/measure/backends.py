@@ -1,0 +1,3 @@
+"""The backends that measurements compare when none is named."""
+
+DEFAULT_BACKENDS = ("hpc", "gears")
