@@ -1,10 +1,13 @@
 """`penumbra bench error`: metrics, slopes and errors against closed forms; files, table and refusals."""
 
 import csv
+import io
 import json
 import math
 import re
+import sys
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +17,17 @@ from numpy.typing import NDArray
 
 import penumbra
 from penumbra.cli.main import run
-from penumbra.errors import BackendError, MemoryLimitError, SceneError
-from penumbra.measure import plots
+from penumbra.errors import BackendError, Interrupted, MemoryLimitError, SceneError
+from penumbra.measure import error, error_report, plots
 from penumbra.measure import scene as measured_scene
 from penumbra.measure.cost import measured
 from penumbra.measure.error import ErrorOptions, cast_reference, measure_error
-from penumbra.measure.error_report import ErrorReport
+from penumbra.measure.error_report import ErrorReport, fit_slopes
 from penumbra.measure.metrics import error_metrics, fit_power_law, without_floor
 from penumbra.measure.report import aligned_table, markdown_table, prepare_outputs
 from penumbra.measure.scene import chosen_light, open_scene
 from penumbra.memory import peak_bytes, reset_peak, resident_bytes
-from penumbra.progress import NullProgress
+from penumbra.progress import LogProgress, NullProgress
 
 # A floor at y = 0 and, at y = 1, a blocker that covers x < 0.
 HALF_PLANE = """\
@@ -150,7 +153,7 @@ def half_plane(tmp_path_factory: pytest.TempPathFactory) -> ErrorReport:
 def test_the_reference_knows_its_own_error(tmp_path: Path) -> None:
     scene = half_plane_scene(tmp_path)
     light = replace(scene.lights[0], samples=2048, sets=1)
-    with open_scene(scene, light, memory=None, process_limit=False, threads=1) as here:
+    with open_scene(scene, [light], ["hpc"], memory=None, process_limit=False, threads=1) as here:
         reference = cast_reference(here, light, "hpc", NullProgress())
         truth = exact_visibility(here.seen.points)
     true_rms = np.sqrt(np.mean((reference.visibility - truth) ** 2))
@@ -204,25 +207,33 @@ def test_files_parse_and_agree(half_plane: ErrorReport, tmp_path: Path) -> None:
     assert paths[2].read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_light_without_penumbra_has_no_error(tmp_path: Path) -> None:
-    scene = half_plane_scene(tmp_path)
-    away = replace(scene.lights[0], corner=[5, 2, -0.5])
-    options = ErrorOptions(resolution=(8, 6), samples=(4, 16), reference=32, backends=("hpc",), threads=1)
-    report = measure_error(replace(scene, lights=(away,)), options)
-    assert report.penumbra_share == 0 and all(row.metrics.maximum == 0 for row in report.rows)
-    assert all(slope.law.slope is None for slope in report.slopes)
+def test_rows_without_error_are_written_and_drawn(half_plane: ErrorReport, tmp_path: Path) -> None:
+    none = error_metrics(np.zeros(0), np.zeros(0), np.zeros(0, bool))
+    rows = [row._replace(metrics=none) for row in half_plane.rows if row.backend == "hpc"]
+    report = replace(half_plane, rows=tuple(rows), slopes=fit_slopes(rows, 0.0), backends=("hpc",))
     report.write([tmp_path / name for name in ("error.json", "error.csv", "error.png")])
     assert json.loads((tmp_path / "error.json").read_text())["slopes"][0]["slope"] is None
+    assert (tmp_path / "error.png").exists()
     assert "hpc alone" in str(report) and "none" in str(report)
 
 
-def test_a_camera_that_sees_nothing_measures_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"camera": penumbra.Camera((0, 5, 0), (0, 9, 0), up=(0, 0, 1))}, "the camera sees no surface"),
+        ({"corner": [5, 2, -0.5]}, r"in penumbra of light 'key' \(each sees all of it\)"),
+        ({"corner": [-6, 2, -0.5]}, r"in penumbra of light 'key' \(each sees none of it\)"),
+    ],
+)
+def test_where_nothing_can_be_wrong_nothing_is_measured(
+    change: dict[str, Any], words: str, tmp_path: Path
+) -> None:
     scene = half_plane_scene(tmp_path)
-    up = penumbra.Camera((0, 5, 0), (0, 9, 0), up=(0, 0, 1), resolution=(8, 6))
-    options = ErrorOptions(resolution=(8, 6), samples=(4, 16), reference=32, backends=("hpc", "gears"))
-    report = measure_error(replace(scene, camera=up), options)
-    assert (report.n_receivers, report.penumbra_share, report.reference_rms) == (0, 0, 0)
-    assert "0 at 8 x 6" in str(report)
+    if "corner" in change:
+        change = {"lights": (replace(scene.lights[0], **change),)}
+    options = ErrorOptions(resolution=(8, 6), samples=(4, 16), reference=32, backends=("hpc",), threads=1)
+    with pytest.raises(SceneError, match=words):
+        measure_error(replace(scene, **change), options)
 
 
 def test_different_backends_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -259,6 +270,7 @@ def test_point_lights_are_refused(tmp_path: Path) -> None:
         ({"samples": (16, 1 << 17)}, "whole numbers from 1 to 65536"),
         ({"samples": (16,), "reference": 24}, "even number from 32"),
         ({"samples": (16,), "reference": 33}, "even number from 32"),
+        ({"samples": (65536,), "reference": 16384}, "even number from 131072"),
         ({"reference": 1 << 18}, "even number"),
         ({"backends": ("fast",)}, "no backend 'fast'"),
     ],
@@ -268,13 +280,40 @@ def test_options_that_cannot_be_measured(wrong: dict[str, Any], word: str) -> No
         ErrorOptions(**wrong)
 
 
-def test_a_limit_that_is_too_low_is_refused_early(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("samples", "reference"), [(4, 16384), (1024, 16384), (20000, 131072)])
+def test_the_reference_grows_with_the_samples(samples: int, reference: int) -> None:
+    assert ErrorOptions(samples=(samples,)).reference == reference
+
+
+@pytest.mark.parametrize("memory", ["32MiB", "224MiB"])
+def test_a_limit_that_is_too_low_is_refused_early(memory: str, tmp_path: Path) -> None:
+    """The second is enough for a render in passes, not for all receivers at once."""
+    camera = replace(half_plane_scene(tmp_path).camera, resolution=(1280, 960))
+    scene = replace(half_plane_scene(tmp_path), camera=camera)
+    how: dict[str, Any] = {"backends": ["hpc", "gears"], "process_limit": False, "threads": 1}
+    lights = [replace(scene.lights[0], samples=8192, sets=1)]
+    with pytest.raises(MemoryLimitError, match="or a smaller --resolution") as refusal:
+        open_scene(scene, lights, memory=memory, **how).__enter__()
+    assert "1280 x 960 receivers with 8192 light samples" in str(refusal.value)
+    assert "--crop" not in str(refusal.value)
+    enough = re.search(r"give (\d+)MiB", str(refusal.value))
+    assert enough is not None
+    # What it names is enough to open the scene and for the largest cast, which is done in passes.
+    with open_scene(scene, lights, memory=f"{enough[1]}MiB", **how) as here:
+        assert here.cast_bytes < here.plan.limit_bytes
+
+
+def test_casts_have_their_memory_however_much_the_process_has_grown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = half_plane_scene(tmp_path)
-    with pytest.raises(MemoryLimitError):
-        measure_error(scene, memory="32MiB")
-    # Enough for a render in passes, not for all receivers at once.
-    with pytest.raises(MemoryLimitError, match="give a smaller --resolution"):
-        measure_error(scene, ErrorOptions(resolution=(1280, 960), samples=(4,), reference=8), memory="224MiB")
+    light = replace(scene.lights[0], samples=512, sets=8)
+    how: dict[str, Any] = {"memory": None, "process_limit": False, "threads": 1}
+    with open_scene(scene, [light], ["hpc", "gears"], **how) as here:
+        expected = here.cast(light, "hpc").visibility
+        monkeypatch.setattr(measured_scene, "resident_bytes", lambda: here.plan.limit_bytes + 1)
+        for backend in ("hpc", "gears"):
+            np.testing.assert_array_equal(here.cast(light, backend).visibility, expected)
 
 
 def test_the_command(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -287,6 +326,10 @@ def test_the_command(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert "square.toml, light key, 4 triangles" in out and "jittered, 8 sets" in out
     assert "done: measure: 6 casts" in err
     facts = json.loads((folder / "error.json").read_text())
+    assert facts["scene_path"] == str(scene_file.resolve()) and facts["is_complete"]
+    assert datetime.now(UTC) - datetime.fromisoformat(facts["date"]) < timedelta(minutes=10)
+    assert facts["camera"]["resolution"] == [24, 18] and len(facts["camera"]["eye"]) == 3
+    assert set(facts["light_settings"]) == {"type", "corner", "edge_u", "edge_v", "radiance", "two_sided"}
     assert facts["resolution"] == [24, 18] and facts["peak_bytes"] <= facts["limit_bytes"]
     assert run(command) == 1
     assert "is there already: give --overwrite" in capsys.readouterr().err
@@ -316,12 +359,120 @@ def test_the_example_for_python_runs(scene_file: Path, monkeypatch: pytest.Monke
 def test_a_missing_matplotlib_is_said_before_any_work(
     scene_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plots, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     folder = scene_file.parent / "measured"
     assert run(["bench", "error", str(scene_file), *QUICK, "-o", str(folder)]) == 1
     out, err = capsys.readouterr()
     assert out == "" and len(err.splitlines()) == 1 and not folder.exists()
     assert "pip install 'penumbra-render[bench]'" in err
+
+
+def test_a_broken_matplotlib_is_said_before_any_work(
+    scene_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(name: str) -> None:
+        if name == "matplotlib.backends.backend_agg":
+            raise RuntimeError("built for another numpy\nand a page of advice")
+
+    monkeypatch.setattr(plots, "import_module", broken)
+    assert run(["bench", "error", str(scene_file), *QUICK, "-o", str(scene_file.parent / "measured")]) == 1
+    out, err = capsys.readouterr()
+    assert out == "" and len(err.splitlines()) == 1
+    assert "installed but broken (RuntimeError: built for another numpy)" in err
+
+
+def test_a_plot_that_fails_costs_no_number(
+    scene_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise ValueError("no font")
+
+    monkeypatch.setattr(plots, "draw_error", fails)
+    folder = scene_file.parent / "measured"
+    assert run(["bench", "-q", "error", str(scene_file), *QUICK, "--backend", "hpc", "-o", str(folder)]) == 1
+    out, err = capsys.readouterr()
+    assert "error of visibility" in out and "no font" in err and len(err.splitlines()) == 1
+    assert sorted(path.name for path in folder.iterdir()) == ["error.csv", "error.json"]
+
+
+def test_files_that_cannot_be_written_cost_no_table(
+    scene_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(error_report, "write_outputs", fails)
+    folder = scene_file.parent / "measured"
+    assert run(["bench", "-q", "error", str(scene_file), *QUICK, "--backend", "hpc", "-o", str(folder)]) == 1
+    out, err = capsys.readouterr()
+    assert "error of visibility" in out and str(folder) not in out and "No space left" in err
+
+
+@pytest.mark.parametrize(
+    ("stop", "code"), [(KeyboardInterrupt(), 130), (Interrupted("stopped by SIGTERM", 75), 75)]
+)
+def test_what_was_finished_is_printed_when_it_is_stopped(
+    stop: BaseException,
+    code: int,
+    scene_file: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of the fourth row one backend is cast and the other is not, so that three are told."""
+    n_casts = 0
+
+    def stopping(*arguments: Any, **named: Any) -> Any:
+        nonlocal n_casts
+        n_casts += 1
+        if n_casts == 7:
+            raise stop
+        return fastest(*arguments, **named)
+
+    fastest = error._fastest_cast
+    monkeypatch.setattr(error, "_fastest_cast", stopping)
+    folder = scene_file.parent / "measured"
+    assert run(["bench", "error", str(scene_file), *QUICK, "-o", str(folder)]) == code
+    out, err = capsys.readouterr()
+    assert out.startswith("INCOMPLETE: the measuring was stopped when 6 rows are finished")
+    assert out.count("regular, 1 set") == 2 * 2 + 1 and out.count("jittered, 8 sets") == 0
+    assert "stopped by" in err and not list(folder.iterdir())
+
+
+def test_a_reference_in_passes_is_one_line(tmp_path: Path) -> None:
+    scene = half_plane_scene(tmp_path)
+    stream = io.StringIO()
+    triangles = np.array([[[-90, 1, -90], [0, 1, -90], [0, 1, 90]]], np.float64)
+    points = np.zeros((5000, 3))
+    for memory, n_passes in (("1GiB", 1), ("1MiB", 2)):
+        progress = LogProgress(stream)
+        penumbra.cast(points, triangles, scene.lights[0], memory=memory, keep="visibility", progress=progress)
+        progress.close()
+        lines = [line for line in stream.getvalue().splitlines() if line.startswith("done: cast")]
+        assert len(lines) == 1 and f" {n_passes} triangles" in lines[0]
+        stream.seek(0)
+        stream.truncate()
+
+
+def test_labels_of_the_plot_do_not_overlap(
+    half_plane: ErrorReport, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures: list[Any] = []
+    monkeypatch.setattr(plots, "save_figure", lambda figure, path: figures.append(figure))
+    # Many points, close to each other.
+    rows = [
+        row._replace(samples=row.samples + extra, cost=row.cost._replace(cpu_seconds=1 + row.samples / 1e4))
+        for extra in range(5)
+        for row in half_plane.rows
+    ]
+    plots.draw_error(replace(half_plane, rows=tuple(rows)), tmp_path / "error.png")
+    (figure,) = figures
+    figure.draw_without_rendering()
+    by_samples, by_seconds = figure.axes
+    assert by_seconds.get_xlabel().startswith("processor seconds") and len(by_seconds.lines) == 3 * 2
+    for texts in (by_seconds.texts, by_samples.get_xticklabels(), by_seconds.get_xticklabels()):
+        boxes = [text.get_window_extent() for text in texts if text.get_text()]
+        assert boxes
+        assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
 
 
 @pytest.mark.parametrize(
@@ -331,7 +482,10 @@ def test_a_missing_matplotlib_is_said_before_any_work(
         (["--samples", "0"], 2, "write it as 16,64,256"),
         (["--backend", "auto"], 2, "auto"),
         (["--resolution", "20"], 2, "write it as 1280x960"),
-        (["--samples", "64", "--reference", "64"], 1, "even number from 128"),
+        (["--samples", "64", "--reference", "64"], 2, "even number from 128"),
+        (["--samples", "64", "--reference", "129"], 2, "even number from 128"),
+        (["--samples", "70000"], 2, "whole numbers from 1 to 65536"),
+        (["--backend", "gear"], 2, "hpc"),
         (["--light", "sun"], 1, "no light 'sun'"),
         (["--memory", "16MiB"], 3, "memory limit"),
     ],
@@ -351,3 +505,10 @@ def test_outputs_are_checked_first(tmp_path: Path) -> None:
     assert prepare_outputs(tmp_path, ["a.json"], overwrite=True) == [tmp_path / "a.json"]
     with pytest.raises(penumbra.errors.OutputError, match="cannot make the folder"):
         prepare_outputs(tmp_path / "a.json" / "b", ["c"], overwrite=False)
+
+
+def test_a_folder_that_cannot_be_written_is_refused_first() -> None:
+    if not Path("/proc/self").is_dir():
+        pytest.skip("needs a folder that nobody can write in")
+    with pytest.raises(penumbra.errors.OutputError, match="choose another"):
+        prepare_outputs(Path("/proc/self"), ["a.json"], overwrite=False)

@@ -51,6 +51,12 @@ def test_whole_sizes_are_exact(count: int, unit: str) -> None:
         (lambda: CastOptions(tile_receivers=0), "tile_receivers"),
         (lambda: CastOptions(leaf_receivers=-1), "leaf_receivers"),
         (lambda: CastOptions(rebuild_fraction=float("nan")), "rebuild_fraction"),
+        (lambda: CastOptions(rebuild_fraction="much"), "rebuild_fraction"),  # type: ignore[arg-type]
+        (lambda: CastOptions(grid_eye="near"), "grid_eye"),  # type: ignore[arg-type]
+        (lambda: CastOptions(grid_resolution=3.5), "grid_resolution is 3.5"),  # type: ignore[arg-type]
+        (lambda: CastOptions(grid_resolution=True), "grid_resolution is True"),
+        (lambda: CastOptions(pair_bytes="16MiB"), "pair_bytes is '16MiB'"),  # type: ignore[arg-type]
+        (lambda: CastOptions(group_size=32.0), "group_size is 32.0"),  # type: ignore[arg-type]
     ],
 )
 def test_options_out_of_range_are_named(options: object, name: str) -> None:

@@ -8,7 +8,16 @@ from hypothesis import strategies as st
 
 from penumbra.errors import MemoryLimitError
 from penumbra.memory import available_bytes, call_limit_bytes, format_bytes, peak_bytes, resident_bytes
-from penumbra.plan import GeometryPlan, LightPlan, make_plan
+from penumbra.options import CastOptions
+from penumbra.plan import (
+    GeometryPlan,
+    LightPlan,
+    backend_bytes,
+    fitted_options,
+    least_cast_bytes,
+    make_plan,
+    receivers_per_pass,
+)
 
 MIB = 1 << 20
 
@@ -55,6 +64,33 @@ def test_a_refusal_names_a_limit_that_would_do(limit, n_triangles, resolution):
         enough = int(re.search(r"give (\d+)MiB", str(refusal)).group(1)) * MIB
         assert enough > limit
         assert plan_of(enough, n_triangles, resolution).needed_bytes <= enough
+
+
+@pytest.mark.parametrize(
+    ("window", "samples", "words"),
+    [
+        (None, 100, "a picture of 1280 x 960 pixels with 100 light samples does"),
+        ((10, 10, 30, 20), 1, "a picture of 20 x 10 pixels (of 1280 x 960) with 1 light sample does"),
+    ],
+)
+def test_a_refusal_says_what_was_asked_for(window, samples, words):
+    with pytest.raises(MemoryLimitError) as refusal:
+        plan_of(100 * MIB, window=window, samples=samples)
+    assert words in str(refusal.value)
+    assert f"give {refusal.value.enough_bytes // MIB}MiB" in str(refusal.value)
+
+
+@given(
+    st.integers(1, 10**6),
+    st.integers(1, 65536),
+    st.sampled_from([1, 8]),
+    st.sampled_from(["hpc", "gears", "reference"]),
+)
+def test_the_least_limit_of_a_cast_is_enough_for_it(n_receivers, n_samples, sets, backend):
+    chunk, read = 65536, 48 * MIB
+    limit = least_cast_bytes(n_receivers, n_samples, sets, read, chunk, backend)
+    held = read + backend_bytes(backend, fitted_options(CastOptions(), limit), chunk)
+    assert receivers_per_pass(n_receivers, n_samples, sets, held, False, limit) >= min(n_receivers, 1024)
 
 
 def test_half_a_gibibyte_does_for_an_ordinary_picture():

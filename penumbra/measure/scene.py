@@ -55,7 +55,7 @@ class OpenScene:
 
     def _cast_first(self, n: int, light: RectLight, backend: str, progress: Progress | None) -> CastResult:
         seen = self.seen
-        # A third for the holes that malloc leaves where pools of masks grew.
+        # Half of what is left: of the masks of a pass, malloc kept most resident in its threads' arenas.
         return cast(
             seen.points[:n],
             self.blockers,
@@ -64,7 +64,7 @@ class OpenScene:
             own=seen.own[:n],
             index=seen.pixel[:n],
             backend=backend,
-            memory=max(self.cast_bytes, 2 * (self.plan.limit_bytes - resident_bytes()) // 3),
+            memory=max(self.cast_bytes, (self.plan.limit_bytes - resident_bytes()) // 2),
             threads=self.plan.threads,
             progress=progress,
             keep="visibility",
