@@ -237,6 +237,11 @@ def _count(
 ) -> None:
     for name, amount in zip(NAMES, counters.sum(axis=0), strict=True):
         stats.count(name, amount)
+    # The joint descent under the names that every backend has: it sets up 16 blockers at a time.
+    found = stats.counters
+    stats.count("pairs_tested", 16 * found["cluster_pairs"] + found["pairs_escalated"])
+    stats.count("nodes_visited", found["tree_nodes_visited"])
+    stats.count("samples_tested", found["lanes_tested"])
     stats.count("receivers_not_cast", n_not_cast)
     stats.count("tiles", len(tiles) + sum(len(side.slices) for side in sides))
     stats.count("rebuilds", sum(tile.n_rebuilds for tile in tiles))

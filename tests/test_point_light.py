@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import oracle
 import pytest
-from backends import BACKENDS, assert_every_bit, cast_scene, masks_of
+from backends import BACKENDS, assert_every_bit, cast_scene, masks_of, way
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from paths import scene_file as shared_scene
@@ -340,7 +340,7 @@ def test_agrees_with_embree_or_is_right(
         half = N_RECEIVERS.get(backend, MANY_RECEIVERS) // 2
         hidden = receivers_behind_vertices(triangles, light, half)
         points = np.concatenate([receivers_above(triangles, half), hidden])
-        blocked = penumbra.cast(points, store, light, backend=backend).visibility == 0
+        blocked = penumbra.cast(points, store, light, **way(backend)).visibility == 0
     samples = np.broadcast_to(light.position, (len(points), 1, 3))
     occluded = embree_bits(tmp_path, triangles, points, samples)[:, 0]
     differ = np.flatnonzero(blocked != occluded)
