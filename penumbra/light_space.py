@@ -97,8 +97,8 @@ def _blocked(lanes: np.ndarray) -> np.ndarray:
 
 def _extents(blocks: np.ndarray) -> np.ndarray:
     low, high = blocks.min(axis=(0, 2)), blocks.max(axis=(0, 2))
-    width = high - low
-    per_unit = np.divide(N_BINS, width, out=np.zeros_like(width), where=width > 1e-6)
+    # Never 0: `_reached` divides by it, and 0 * inf would drop blockers.
+    per_unit = N_BINS / np.maximum(high - low, np.float32(1e-6))
     return np.concatenate([low, high, per_unit], axis=1).astype(np.float32)
 
 
@@ -115,9 +115,12 @@ def _tables(blocks: np.ndarray, extents: np.ndarray, n_samples: int) -> UInt64Ar
     last = np.concatenate([bins, bins.min(axis=0, keepdims=True)])
     every = np.arange(N_BINS, dtype=np.uint8)[:, None]
     exists = (np.arange(blocks.shape[1] * BLOCK) < n_samples).reshape(-1, 1, BLOCK)
-    kinds = []
-    for axis in range(2):
-        kinds.append((first[:, :, None, :, axis] >= every) & exists)
-        kinds.append((last[:, :, None, :, axis] <= every) & exists)
-    packed = np.packbits(np.stack(kinds, axis=2), axis=-1, bitorder="little")
-    return np.ascontiguousarray(packed).view(np.uint64)
+    packed = np.empty((len(first), blocks.shape[1], 4, N_BINS, BLOCK // 8), np.uint8)
+    # Set by set: as booleans, eight times as large, all of them would be more than the light's samples.
+    for number in range(len(first)):
+        for axis in range(2):
+            above = (first[number, :, None, :, axis] >= every) & exists
+            below = (last[number, :, None, :, axis] <= every) & exists
+            packed[number, :, 2 * axis] = np.packbits(above, axis=-1, bitorder="little")
+            packed[number, :, 2 * axis + 1] = np.packbits(below, axis=-1, bitorder="little")
+    return packed.view(np.uint64)

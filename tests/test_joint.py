@@ -3,6 +3,8 @@
 import numba
 import numpy as np
 import pytest
+from backends import assert_every_bit
+from scenes import SmallScene
 
 import penumbra
 from penumbra.api import cast
@@ -189,3 +191,14 @@ def test_ordinary_lanes_are_seldom_left_open(rng):
     light = RectLight([-0.5, 3, -0.5], [1, 0, 0], [0, 0, 1], samples=256)
     counters = penumbra.cast(points, grass, light).stats.counters
     assert 0 < counters["escalated_f64"] < 1e-3 * counters["lanes_tested"]
+
+
+@pytest.mark.parametrize("roll", range(3))
+@pytest.mark.parametrize("turn", [False, True])
+def test_samples_in_one_row(roll: int, turn: bool) -> None:
+    """All samples share one t: an edge parallel to the light's side must not meet an interval without end."""
+    edge_u, edge_v = ((0, 0, 0.01), (4, 0, 0)) if turn else ((4, 0, 0), (0, 0, 0.01))
+    light = RectLight((-2, 3, 0), edge_u, edge_v, samples=16, sets=1, pattern="regular", two_sided=True)
+    triangle = np.roll(np.array([[0.0, 1, -1], [1.0, 1, 0], [0.0, 1, 1]]), roll, axis=0)
+    points = np.array([[0.1, 0, 0.0], [0.3, 0, 0.1], [-0.3, 0, 0.2]])
+    assert assert_every_bit(SmallScene(points, triangle[None], light), "hpc").any()

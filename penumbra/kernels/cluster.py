@@ -341,7 +341,9 @@ def cast_pair(tree, leaves, light, block, cluster, leaf, pair, extent, scratch, 
             store(c, 160, (muladd(n[0], g[0], muladd(n[1], g[1], n[2] * g[2])) - height) * turn)
             store(c, 176, n[0] * turn)
             store(c, 192, n[1] * turn)
-            reach = splat(leaves.reaches[leaf, 1] * np.float32(32.0 * _ROUNDOFF))
+            reach = splat(
+                leaves.reaches[leaf, 1] * np.float32(32.0 * _ROUNDOFF) + np.float32(4.0 * light.residual)
+            )
             slack = load(scratch.cluster, 48) * splat(np.float32(4.0))
             store(c, 208, slack + load(tree.lanes, first + 256) * reach)
             store(c, 224, turn)
