@@ -29,6 +29,8 @@ def main() -> None:
     parser.add_argument("--plots", type=Path, help="folder to copy the plots to, such as docs/images")
     mine, passed_on = _split(sys.argv[1:])
     arguments = parser.parse_args(mine)
+    if arguments.plots is not None:
+        arguments.plots.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
         out = arguments.out or Path(scratch)
         for name in arguments.scenes:
