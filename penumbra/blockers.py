@@ -1,11 +1,13 @@
 """The blockers as casting sees them: chunks in casting order, wherever they are kept."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol
 
 from penumbra.arrays import BlockerChunk, ChunkInfo, Float64Array
 from penumbra.io.buckets import bounds_of
+from penumbra.progress import Progress
+from penumbra.stats import Stats
 
 
 class Blockers(Protocol):
@@ -69,6 +71,35 @@ def prefetch(blockers: Blockers, chunk_indices: Iterable[int]) -> Iterator[tuple
             pending = ahead
         if pending is not None:
             yield pending[0], pending[1].result()
+
+
+def stream_wanted(
+    blockers: Blockers,
+    is_wanted: Callable[[int], bool],
+    *,
+    large_first: bool,
+    progress: Progress,
+    stats: Stats,
+) -> Iterator[tuple[int, BlockerChunk]]:
+    """Yield (i, chunk i) of the chunks that are wanted, in casting order or its reverse; count bytes.
+
+    is_wanted is asked on the caller's thread, one chunk ahead of the one that is worked on. A chunk that
+    is not wanted is never read; progress advances over it.
+    """
+    order = range(len(blockers.chunks))
+
+    def wanted() -> Iterator[int]:
+        """Chunks to read."""
+        for number in order if large_first else reversed(order):
+            info = blockers.chunks[number]
+            if is_wanted(number):
+                stats.count("bytes_read", info.n_bytes)
+                yield number
+            else:
+                stats.count("bytes_skipped", info.n_bytes)
+                progress.advance(info.count)
+
+    return prefetch(blockers, wanted())
 
 
 def _chunk_infos(bucket: int, chunks: Sequence[BlockerChunk]) -> Iterator[ChunkInfo]:

@@ -1,6 +1,6 @@
 """6: backend "hpc", hierarchical penumbra casting (Laine & Aila 2005, section 3)."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from penumbra.arrays import (
     UInt8Array,
     UInt64Array,
 )
-from penumbra.blockers import Blockers, prefetch
+from penumbra.blockers import Blockers, stream_wanted
 from penumbra.executors.threads import run_tasks
 from penumbra.facing import CastStart, face_light, full_mask
 from penumbra.joint import JointCast, JointReceivers, joint_cast
@@ -29,7 +29,7 @@ from penumbra.stats import Stats
 
 _NEVER = 2**62
 
-CastTile = Callable[[ReceiverTile, BlockerChunk, LightSamples, CastOptions, np.ndarray], None]
+CastStep = Callable[[ReceiverTile, BlockerChunk, int, LightSamples, CastOptions, np.ndarray], tuple[int, int]]
 
 
 def cast_receivers(
@@ -57,9 +57,9 @@ def cast_receivers(
         rest = start._replace(live=joint.rest)
         tiles = _make_tiles(receivers, rest, extent, options, threads, has_masks=not is_point)
     with stats.timed("cast"):
-        cast_tile = _cast_tile_from_point if is_point else _cast_tile
+        step = _cast_from_point if is_point else _cast_from_area
         counters = _cast_chunks(
-            joint.sides, tiles, blockers, start.samples, cast_tile, options, threads, progress, stats
+            joint.sides, tiles, blockers, start.samples, step, options, threads, progress, stats
         )
     for tile in tiles:
         tile.copy_masks(start.masks)
@@ -107,7 +107,7 @@ def _cast_chunks(
     tiles: list[ReceiverTile],
     blockers: Blockers,
     samples: LightSamples,
-    cast_tile: CastTile,
+    step: CastStep,
     options: CastOptions,
     threads: int,
     progress: Progress,
@@ -118,28 +118,21 @@ def _cast_chunks(
     boxes = np.array([chunk.box for chunk in blockers.chunks]).reshape(-1, 2, 3)
     touches = np.array([tile.touches(boxes) for tile in tiles]).reshape(len(tiles), len(boxes))
     joint_touches = [side.touches(boxes) for side in sides]
-    order = range(len(boxes)) if options.sort else range(len(boxes) - 1, -1, -1)
 
-    def wanted() -> Iterator[int]:
-        """Chunks that may still block something; the others are never read."""
-        for number in order:
-            info = blockers.chunks[number]
-            if any(touches[k, number] and tile.n_live for k, tile in enumerate(tiles)) or any(
-                (touch[:, number] & side.open_slices()).any()
-                for side, touch in zip(sides, joint_touches, strict=True)
-            ):
-                stats.count("bytes_read", info.n_bytes)
-                yield number
-            else:
-                stats.count("bytes_skipped", info.n_bytes)
-                progress.advance(info.count)
+    def is_wanted(number: int) -> bool:
+        """Whether a chunk may still block something."""
+        return any(touches[k, number] and tile.n_live for k, tile in enumerate(tiles)) or any(
+            (touch[:, number] & side.open_slices()).any()
+            for side, touch in zip(sides, joint_touches, strict=True)
+        )
 
     progress.stage("cast", blockers.n_triangles, "triangles")
-    for number, chunk in prefetch(blockers, wanted()):
+    chunks = stream_wanted(blockers, is_wanted, large_first=options.sort, progress=progress, stats=stats)
+    for number, chunk in chunks:
         work = [k for k, tile in enumerate(tiles) if touches[k, number] and tile.n_live]
 
         def task(k: int, chunk: BlockerChunk = chunk) -> None:
-            cast_tile(tiles[k], chunk, samples, options, counters[k])
+            _cast_tile(step, tiles[k], chunk, samples, options, counters[k])
 
         run_tasks(task, work, threads)
         for side, touch in zip(sides, joint_touches, strict=True):
@@ -149,55 +142,71 @@ def _cast_chunks(
 
 
 def _cast_tile(
-    tile: ReceiverTile, chunk: BlockerChunk, samples: LightSamples, options: CastOptions, counters: np.ndarray
+    step: CastStep,
+    tile: ReceiverTile,
+    chunk: BlockerChunk,
+    samples: LightSamples,
+    options: CastOptions,
+    counters: np.ndarray,
 ) -> None:
     """Cast a chunk on a tile; between blockers, grow its mask pool and rebuild its hierarchy as needed."""
-    switches = _switches(options)
-    start, reason = 0, POOL_EMPTY
+    start, reason = 0, int(REBUILD)
     while reason != DONE and tile.n_live:
-        scratch = _scratch(tile.depth, len(samples.full_groups))
-        start, reason = cast_blockers(
-            chunk,
-            start,
-            _rebuild_at(tile, options),
-            tile.shaft,
-            tile.bvh,
-            tile.pool,
-            samples,
-            options.group_size,
-            switches,
-            scratch,
-            counters,
-        )
+        start, reason = step(tile, chunk, start, samples, options, counters)
         if reason == POOL_EMPTY:
             tile.grow_pool()
             tile.refresh_umbra()
-        elif reason != DONE:
+        elif reason == REBUILD:
             tile.rebuild()
 
 
-def _cast_tile_from_point(
-    tile: ReceiverTile, chunk: BlockerChunk, samples: LightSamples, options: CastOptions, counters: np.ndarray
-) -> None:
-    """Cast a chunk on a tile of a point light; between blockers, rebuild its hierarchy as needed."""
-    switches = _switches(options)
-    start, reason = 0, REBUILD
-    while reason != DONE and tile.n_live:
-        scratch = PointScratch(np.empty((2 * tile.depth + 6, 2), np.int32), np.zeros((5, 8)))
-        start, reason = cast_blockers_from_point(
-            chunk,
-            start,
-            _rebuild_at(tile, options),
-            tile.shaft,
-            tile.bvh,
-            tile.pool,
-            samples,
-            switches,
-            scratch,
-            counters,
-        )
-        if reason == REBUILD:
-            tile.rebuild()
+def _cast_from_area(
+    tile: ReceiverTile,
+    chunk: BlockerChunk,
+    start: int,
+    samples: LightSamples,
+    options: CastOptions,
+    counters: np.ndarray,
+) -> tuple[int, int]:
+    """Cast the blockers from `start` on; returns where it stopped, and why (DONE, POOL_EMPTY, REBUILD)."""
+    stop, reason = cast_blockers(
+        chunk,
+        start,
+        _rebuild_at(tile, options),
+        tile.shaft,
+        tile.bvh,
+        tile.pool,
+        samples,
+        options.group_size,
+        _switches(options),
+        _scratch(tile.depth, len(samples.full_groups)),
+        counters,
+    )
+    return int(stop), int(reason)
+
+
+def _cast_from_point(
+    tile: ReceiverTile,
+    chunk: BlockerChunk,
+    start: int,
+    samples: LightSamples,
+    options: CastOptions,
+    counters: np.ndarray,
+) -> tuple[int, int]:
+    """`_cast_from_area` for a point light, which takes no masks (DONE or REBUILD)."""
+    stop, reason = cast_blockers_from_point(
+        chunk,
+        start,
+        _rebuild_at(tile, options),
+        tile.shaft,
+        tile.bvh,
+        tile.pool,
+        samples,
+        _switches(options),
+        PointScratch(np.empty((2 * tile.depth + 6, 2), np.int32), np.zeros((5, 8))),
+        counters,
+    )
+    return int(stop), int(reason)
 
 
 def _switches(options: CastOptions) -> CastSwitches:

@@ -18,7 +18,7 @@ from penumbra.arrays import (
     UInt8Array,
     UInt64Array,
 )
-from penumbra.blockers import Blockers, prefetch
+from penumbra.blockers import Blockers, stream_wanted
 from penumbra.executors.threads import run_tasks
 from penumbra.facing import CastStart, face_light, full_mask
 from penumbra.kernels.counters import N_COUNTERS, NAMES
@@ -64,9 +64,16 @@ def cast_receivers(
             spacing=options.grid_spacing,
         )
     casts = [_GridCast(grid, receivers, start, options, threads, stats) for grid in grids]
+
+    def is_wanted(number: int) -> bool:
+        """Whether a chunk may still block something."""
+        box = blockers.chunks[number].box
+        return any(grid.touched_by(box, options.correct_extrusion) for grid in grids)
+
     progress.stage("cast", blockers.n_triangles, "triangles")
     with stats.timed("cast"):
-        for chunk in _chunks(blockers, grids, options, progress, stats):
+        chunks = stream_wanted(blockers, is_wanted, large_first=options.sort, progress=progress, stats=stats)
+        for _, chunk in chunks:
             for cast in casts:
                 cast.cast(chunk)
             progress.advance(len(chunk.ids))
@@ -74,26 +81,6 @@ def cast_receivers(
         cast.report()
     stats.count("receivers_not_cast", len(receivers.points) - len(start.live))
     return start.masks, start.sample_sets, stats
-
-
-def _chunks(
-    blockers: Blockers, grids: list[ShadowGrid], options: CastOptions, progress: Progress, stats: Stats
-) -> Iterator[BlockerChunk]:
-    """Chunks that may still block something; the others are never read."""
-
-    def wanted() -> Iterator[int]:
-        order = range(len(blockers.chunks))
-        for number in order if options.sort else reversed(order):
-            info = blockers.chunks[number]
-            if any(grid.touched_by(info.box, options.correct_extrusion) for grid in grids):
-                stats.count("bytes_read", info.n_bytes)
-                yield number
-            else:
-                stats.count("bytes_skipped", info.n_bytes)
-                progress.advance(info.count)
-
-    for _, chunk in prefetch(blockers, wanted()):
-        yield chunk
 
 
 class _GridCast:

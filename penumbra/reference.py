@@ -3,7 +3,7 @@
 import numpy as np
 
 from penumbra.arrays import BlockerChunk, Receivers, UInt8Array, UInt64Array
-from penumbra.blockers import Blockers, prefetch
+from penumbra.blockers import Blockers, stream_wanted
 from penumbra.executors.threads import run_tasks
 from penumbra.facing import face_light
 from penumbra.kernels.counters import N_COUNTERS, NAMES
@@ -36,8 +36,10 @@ def cast_receivers(
     slices = [live[first : first + _SLICE_RECEIVERS] for first in range(0, len(live), _SLICE_RECEIVERS)]
     progress.stage("cast", blockers.n_triangles, "triangles")
     with stats.timed("cast"):
-        for number, chunk in prefetch(blockers, range(len(blockers.chunks)) if slices else ()):
-            stats.count("bytes_read", blockers.chunks[number].n_bytes)
+        chunks = stream_wanted(
+            blockers, lambda _: bool(slices), large_first=True, progress=progress, stats=stats
+        )
+        for _, chunk in chunks:
 
             def cast_slice(rows: np.ndarray, chunk: BlockerChunk = chunk) -> np.ndarray:
                 """Cast the chunk on some rows of the masks; the counters (N_COUNTERS,)."""

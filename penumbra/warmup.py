@@ -36,8 +36,9 @@ def warm_up(progress: Progress | None = None) -> Path:
         ingest([folder / "a.obj", folder / "b.ply"], folder / "scene.h5").close()
         for backend in ("hpc", "gears", "reference"):
             render(_scene(folder / "scene.h5"), folder / f"{backend}.exr", backend=backend)
-        # Lights without a light space, such as those of zero area, are cast one blocker at a time.
-        point = RectLight([0, 2, 0], [0, 0, 0], [0, 0, 0], samples=1)
+        # Lights without a light space, such as those of zero area, are cast one blocker at a time; receivers
+        # would not face such a light if it had one side.
+        point = RectLight([0, 2, 0], [0, 0, 0], [0, 0, 0], samples=1, two_sided=True)
         cast(np.zeros((1, 3)), folder / "scene.h5", point)
     progress.close()
     return cache_folder()

@@ -19,24 +19,6 @@ def _samples(_context: click.Context, _parameter: click.Parameter, value: str) -
     return numbers
 
 
-_output = click.option(
-    "-o",
-    "--output",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Also write error.json, error.csv and error.png (needs matplotlib) into this folder.",
-)
-_light = click.option(
-    "--light", metavar="NAME", help="The area light to measure (default: the first of the scene)."
-)
-_resolution = click.option(
-    "--resolution",
-    metavar="WxH",
-    callback=options.resolution_of,
-    default="320x240",
-    show_default=True,
-    help="Pixels whose visible points are the receivers, in place of the scene's.",
-)
 _sample_counts = click.option(
     "--samples",
     metavar="N,N,...",
@@ -52,23 +34,16 @@ _reference = click.option(
     help="Light samples of the reference: an even number, from twice the most of --samples to 131072"
     " (default: 16 times the most of --samples, at least 16384).",
 )
-_backend = click.option(
-    "--backend",
-    "backends",
-    multiple=True,
-    type=click.Choice([name for name in options.BACKENDS if name != "auto"]),
-    help="A backend to measure; may be given more than once (default: hpc and gears).",
-)
 
 
 @click.command()
 @options.scene_path
-@_output
-@_light
-@_resolution
+@options.report_folder("error.json, error.csv and error.png (needs matplotlib)")
+@options.area_light("measure")
+@options.pixels("320x240", "Pixels whose visible points are the receivers, in place of the scene's.")
 @_sample_counts
 @_reference
-@_backend
+@options.backends("measure", "auto")
 @options.memory("4GiB")
 @options.threads
 @options.seed

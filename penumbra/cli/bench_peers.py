@@ -8,33 +8,6 @@ import click
 from penumbra.cli import options
 from penumbra.cli.console import Console, deliver
 
-scenes = click.argument("scenes", metavar="[SCENE]...", nargs=-1)
-_output = click.option(
-    "-o",
-    "--output",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Also write peers.json, peers.csv and peers.png (needs matplotlib) into this folder.",
-)
-sets = click.option(
-    "--sets",
-    metavar="N",
-    type=click.IntRange(min=1, max=256),
-    default=1,
-    show_default=True,
-    help="Sample sets of the light, in place of the scene's.",
-)
-light = click.option(
-    "--light", metavar="NAME", help="The area light to cast (default: the first of the scene)."
-)
-rounds = click.option(
-    "--rounds",
-    metavar="N",
-    type=click.IntRange(min=1),
-    default=3,
-    show_default=True,
-    help="Passes of each side, in turn.",
-)
 _judged = click.option(
     "--judged",
     metavar="N",
@@ -52,13 +25,13 @@ _mitsuba = click.option(
 
 
 @click.command()
-@scenes
-@_output
+@options.scenes
+@options.report_folder("peers.json, peers.csv and peers.png (needs matplotlib)")
 @options.resolution
 @options.samples
-@sets
-@light
-@rounds
+@options.sets
+@options.area_light("cast")
+@options.rounds
 @_judged
 @_mitsuba
 @options.backend

@@ -6,18 +6,10 @@ from typing import Any
 import click
 
 from penumbra.cli import options
-from penumbra.cli.bench_peers import light, rounds, scenes, sets
 from penumbra.cli.console import Console, deliver
 
 _AXES = ("triangles", "resolution", "samples", "area")
 
-_output = click.option(
-    "-o",
-    "--output",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Also write scaling.json, scaling.csv and scaling.png (needs matplotlib) into this folder.",
-)
 _axis = click.option(
     "--axis",
     "axes",
@@ -33,14 +25,6 @@ _levels = click.option(
     show_default=True,
     help="How often the surface is subdivided, every triangle in four.",
 )
-_resolution = click.option(
-    "--resolution",
-    metavar="WxH",
-    callback=options.resolution_of,
-    default="640x480",
-    show_default=True,
-    help="Pixels of the base; the axis has a quarter and four times as many, too.",
-)
 _samples = click.option(
     "--samples",
     metavar="N",
@@ -53,15 +37,15 @@ _embree = click.option("--embree", is_flag=True, help="Measure Embree beside us 
 
 
 @click.command()
-@scenes
-@_output
+@options.scenes
+@options.report_folder("scaling.json, scaling.csv and scaling.png (needs matplotlib)")
 @_axis
 @_levels
-@_resolution
+@options.pixels("640x480", "Pixels of the base; the axis has a quarter and four times as many, too.")
 @_samples
-@sets
-@light
-@rounds
+@options.sets
+@options.area_light("cast")
+@options.rounds
 @_embree
 @options.backend
 @options.threads

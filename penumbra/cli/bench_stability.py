@@ -32,20 +32,6 @@ def _known_cases(
     return value
 
 
-_output = click.option(
-    "-o",
-    "--output",
-    metavar="FOLDER",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Also write stability.json and stability.csv into this folder.",
-)
-_backend = click.option(
-    "--backend",
-    "backends",
-    multiple=True,
-    type=click.Choice([name for name in options.BACKENDS if name not in ("auto", "reference")]),
-    help="A backend to judge; may be given more than once (default: hpc and gears).",
-)
 _case = click.option(
     "--case",
     "cases",
@@ -67,8 +53,8 @@ _quick = click.option("--quick", is_flag=True, help="Small scenes: bits are judg
 
 
 @click.command()
-@_output
-@_backend
+@options.report_folder("stability.json and stability.csv")
+@options.backends("judge", "auto", "reference")
 @_case
 @_seed
 @_quick

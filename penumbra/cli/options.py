@@ -8,8 +8,11 @@ option          commands               meaning
 --scratch       ingest, render         folder of temporary files
 --resolution    render, bench          WxH in place of the scene's
 --samples       render                 light samples in place of the scene's
---backend       render                 how visibility is decided
+--backend       render, bench          how visibility is decided
 --threads       render, bench          0: all
+--light         bench                  the area light to measure
+--sets          bench                  sample sets in place of the scene's
+--rounds        bench                  passes to take the median of
 --crop          render                 the part of the picture to render
 --seed          render, bench          of the light samples
 --resume        render                 keep a finished image of the same settings
@@ -120,6 +123,64 @@ def memory(default: str) -> Callable[..., Any]:
     )
 
 
+def report_folder(files: str) -> Callable[..., Any]:
+    """-o of a benchmark: the folder of the files that it names."""
+    return click.option(
+        "-o",
+        "--output",
+        metavar="FOLDER",
+        type=click.Path(path_type=Path, file_okay=False),
+        help=f"Also write {files} into this folder.",
+    )
+
+
+def area_light(purpose: str) -> Callable[..., Any]:
+    """--light of a benchmark."""
+    return click.option(
+        "--light", metavar="NAME", help=f"The area light to {purpose} (default: the first of the scene)."
+    )
+
+
+def backends(purpose: str, *left_out: str) -> Callable[..., Any]:
+    """--backend of a benchmark that compares several."""
+    return click.option(
+        "--backend",
+        "backends",
+        multiple=True,
+        type=click.Choice([name for name in BACKENDS if name not in left_out]),
+        help=f"A backend to {purpose}; may be given more than once (default: hpc and gears).",
+    )
+
+
+def pixels(default: str, what: str) -> Callable[..., Any]:
+    """--resolution of a benchmark, with its default."""
+    return click.option(
+        "--resolution",
+        metavar="WxH",
+        callback=resolution_of,
+        default=default,
+        show_default=True,
+        help=what,
+    )
+
+
+scenes = click.argument("scenes", metavar="[SCENE]...", nargs=-1)
+sets = click.option(
+    "--sets",
+    metavar="N",
+    type=click.IntRange(min=1, max=256),
+    default=1,
+    show_default=True,
+    help="Sample sets of the light, in place of the scene's.",
+)
+rounds = click.option(
+    "--rounds",
+    metavar="N",
+    type=click.IntRange(min=1),
+    default=3,
+    show_default=True,
+    help="Passes of each side, in turn.",
+)
 overwrite = click.option("--overwrite", is_flag=True, help="Replace the output if it is there.")
 skip_bad = click.option(
     "--skip-bad", is_flag=True, help="Drop and count what is wrong in a mesh, do not fail."

@@ -75,7 +75,7 @@ def _samples_between(tables, table, bins, level, lane):
 
 @inlined
 def _cast_cluster(tree, leaves, light, block, cluster, leaf, extent, scratch, counters):
-    """Cast one cluster on the receivers of a leaf; returns whether a sample became blocked."""
+    """Cast one cluster on the receivers of a leaf; returns whether any of them was tested."""
     counters[CLUSTERS_VISITED] += 1
     node, lane = cluster >> 4, cluster & 15
     nodes = tree.nodes
@@ -177,7 +177,7 @@ def _cast_leaf(tree, leaves, light, block, leaf, scratch, counters):
     table = (np.int64(light.parameters.shape[0]) * light.full.shape[0] + block) * (4 * _TABLE)
     changed = False
     for root in range(tree.first_node[2], tree.first_node[3]):
-        # Nodes in hand and their children not yet visited, one of each level in 10 bits and 16 bits.
+        # The node in hand and its children not yet visited, by level.
         level = np.int64(2)
         node0 = node1 = np.int64(0)
         node2 = np.int64(root)

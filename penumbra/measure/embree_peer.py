@@ -41,6 +41,7 @@ class EmbreePeer:
         vertices, triangles = (np.load(Path(mesh) / f"{name}.npy") for name in ("vertices", "triangles"))
 
         def work() -> Answer:
+            """Build, and what Embree says of it."""
             self._scene = scene = EmbreeScene(vertices, triangles, threads, robust, compact)
             return {
                 "version": scene.version,

@@ -67,6 +67,7 @@ class MitsubaPeer:
         """Estimate visibility with rows x rows samples; timed until it is there."""
 
         def work() -> Answer:
+            """Trace every sample of every receiver, and wait for the result."""
             mi, dr = self._mi, self._dr
             random = mi.PCG32(size=self._n_receivers, initstate=seed)
             seen = dr.zeros(mi.Float, self._n_receivers)

@@ -64,6 +64,7 @@ class PenumbraPeer:
         self._masks = None
 
         def work() -> Answer:
+            """Cast, and keep the bits."""
             result = penumbra.cast(
                 case.points[rows],
                 self._store,
