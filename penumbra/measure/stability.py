@@ -41,7 +41,7 @@ _REPEAT_SECONDS = 0.25
 # All times are divided by those of the two ordinary scenes, which are the shortest.
 _ORDINARY_REPEATS = 25
 
-Timed = tuple[CastResult, float]
+Timed = tuple[list[CastResult], float]
 """What was cast, and the median of its processor seconds."""
 
 
@@ -133,9 +133,10 @@ def _judge_case(
         for backend in options.backends:
             # The ordinary scene itself has been cast and timed.
             timed = ordinary.get(case.name, {}) if (scale, offset) == PLAIN else {}
-            result, seconds = timed.get(backend) or _timed_cast(scene, backend, threads)
-            counters: dict[str, Any] = result.stats.as_dict()
-            first, n_wrong = _compare(_masks(result), expected)
+            results, seconds = timed.get(backend) or _timed_cast(scene, backend, threads)
+            counters: dict[str, Any] = results[-1].stats.as_dict()
+            compared = [_compare(_masks(result), expected) for result in results]
+            first, n_wrong = max(compared, key=lambda found: found[1])
             yield StabilityRow(
                 case=case.name,
                 scale=scale,
@@ -165,13 +166,19 @@ def _cast(scene: HardScene, backend: str, threads: int = 1) -> CastResult:
 
 
 def _timed_cast(scene: HardScene, backend: str, threads: int, repeats: int = _REPEATS) -> Timed:
-    """The result, and the median processor time of a few casts (of fewer where they are slow)."""
+    """The results and the median processor time of a few casts (of fewer where they are slow).
+
+    Results whose bits are those of an earlier one are left out: more than one is left only by a race.
+    """
     seconds: list[float] = []
+    results: list[CastResult] = []
     while len(seconds) < repeats and sum(seconds) < _REPEAT_SECONDS:
         began = time.process_time()
         result = _cast(scene, backend, threads)
         seconds.append(time.process_time() - began)
-    return result, median(seconds)
+        if not any(np.array_equal(_masks(result), _masks(other)) for other in results):
+            results.append(result)
+    return results, median(seconds)
 
 
 def _masks(result: CastResult) -> UInt64Array:
